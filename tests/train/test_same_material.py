@@ -110,6 +110,18 @@ def test_a_balls_lower_half_is_of_its_upper_halfs_metal():
     assert like[3] == pytest.approx(1 / (1 + math.exp(3)), abs=0.05), "its roughness"
 
 
+def test_evidence_spreads_as_far_however_dense_surfels_are():
+    """Check how far the top of a mirror ball tells that the rest, of which photos tell nothing, is metal."""
+    lowest = []
+    for count in (8000, 32000):
+        points, normals, ball = ball_on_board(count)
+        told = ball & (points[:, 2] > 1.8)
+        metallic = torch.where(told, raw_metallic(0.98), raw_metallic(0.02))
+        found = decided(points, normals, torch.where(told, 0.3, 1.0), metallic)
+        lowest.append(float(points[found.metal, 2].quantile(0.02)))
+    assert lowest == pytest.approx([1.37, 1.37], abs=0.04)
+
+
 def test_metals_that_nothing_was_learned_of_are_as_they_fit():
     points, normals, ball = ball_on_board()
     found = decided(points, normals, torch.where(ball, 0.3, 1.0), torch.full((len(points),), raw_metallic(0.02)))

@@ -28,7 +28,9 @@ KEPT_PAINT, KEPT_METAL = 0.045, 0.15  # weight of the kind so far
 LIKELY, UNLIKELY = 0.5, 0.2
 OPEN = 0.02 * SURE  # weight with which `doubt` takes a surfel for neither
 FITTED = 0.01  # weight of a metal that was only fitted, beside one that was learned
-REACH = 3.0  # how far evidence spreads, as the weight of differences between neighbours
+# How far evidence spreads: the weight of differences between neighbours. It grows with the number of surfels, so that evidence spreads as
+# far over a surface however densely surfels lie on it, and is at least what few surfels need.
+REACH, LEAST_REACH = 3.75e-4, 3.0
 NEIGHBOURS = 16
 BENT, CREASED = 0.35, 0.12  # radians between neighbours' normals that convex and concave surfaces have at the most
 STEP = 0.5  # sine by which a neighbour may lie off the surfel's plane
@@ -95,8 +97,13 @@ def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix
 
 
 def _solve(graph: sparse.csr_matrix, weight: np.ndarray, weighted: np.ndarray) -> np.ndarray:
-    """Return the values x (N,) that minimise Σ w_i (x_i − v_i)² + REACH Σ g_ij (x_i − x_j)², where `weighted` is w v."""
-    return cg(REACH * graph + sparse.diags(weight), weighted, rtol=TOLERANCE, maxiter=STEPS)[0]
+    """Return the values x (N,) that minimise Σ w_i (x_i − v_i)² + reach Σ g_ij (x_i − x_j)², where `weighted` is w v.
+
+    The second sum approximates the integral of the squared gradient over the surface, which does not depend on N, but the first grows with
+    N. So the reach grows with N.
+    """
+    reach = max(REACH * len(weight), LEAST_REACH)
+    return cg(reach * graph + sparse.diags(weight), weighted, rtol=TOLERANCE, maxiter=STEPS)[0]
 
 
 def _laplacian(points: np.ndarray, seen: Seen) -> sparse.csr_matrix:
