@@ -51,7 +51,7 @@ def test_stopped_resumed_killed_and_added_to(shelf, ball_capture):
     stopped = batch(shelf / "list.toml", out)
     until(stopped, training.exists)
     stopped.send_signal(signal.SIGTERM)
-    status, said = ended(stopped)
+    status, said = ended(stopped, grace=120)  # a busy machine takes more than the 25 s after which it ends without Ray
     assert status == 75, said
     assert list((out / "ball" / "checkpoints").glob("*.toml")) and not (out / "ball" / "splats.ply").exists()
     assert "stopped" in (out / "index.html").read_text()
