@@ -1,3 +1,5 @@
+import os
+
 import pytest
 import tomli_w
 import torch
@@ -71,7 +73,18 @@ def another_iteration(data, note):
     note.write_text(note.read_text().replace("iteration = 20", "iteration = 200"))
 
 
+def endless_note(data, note):
+    note.unlink()
+    note.symlink_to("/dev/zero")
+
+
+def endless_data(data, note):
+    data.unlink()
+    data.symlink_to("/dev/zero")
+
+
 DAMAGES = [truncate, empty_note, half_a_note, no_text, no_data, not_a_number, another_shape, another_iteration]
+DAMAGES += [endless_note, endless_data] if os.path.exists("/dev/zero") else []
 
 
 @pytest.mark.parametrize("damage", DAMAGES)

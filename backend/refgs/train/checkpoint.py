@@ -17,7 +17,7 @@ from torch import Tensor
 
 from refgs.errors import InputError, TryAgain, reason
 from refgs.events import Report
-from refgs.paths import hash_file, whole
+from refgs.paths import hash_file, read_text, whole
 
 KEPT = 2
 _HASH = "hash = "  # begins the TOML file's first line
@@ -75,7 +75,7 @@ def load(folder: Path, report: Report = lambda event, facts: None) -> tuple[dict
     for iteration in reversed(_begun(folder)):
         try:
             return _read(folder, iteration)
-        except (OSError, ValueError, KeyError, RecursionError, SafetensorError) as error:
+        except (InputError, OSError, ValueError, KeyError, RecursionError, SafetensorError) as error:
             for file in _files(folder, iteration):
                 with suppress(OSError):  # not there, or in a folder that is read-only
                     os.replace(file, file.with_name(file.name + DAMAGED))
@@ -98,7 +98,9 @@ def _files(folder: Path, iteration: int) -> tuple[Path, Path]:
 def _read(folder: Path, iteration: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read a checkpoint. Raises one of many errors if it is damaged."""
     data, note = _files(folder, iteration)
-    whole_text = note.read_text(encoding="utf-8")
+    whole_text = read_text(note, "").replace("\r\n", "\n")  # as it was hashed
+    if data.exists() and not data.is_file():  # a device may have no end
+        raise ValueError(f"{data.name} is not a file")
     head, _, text = whole_text.partition("\n")
     if not head.startswith(_HASH):  # an earlier release wrote none
         text = whole_text
