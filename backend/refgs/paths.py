@@ -95,7 +95,7 @@ def write_text(file: Path, text: str, durable: bool = True) -> None:
 def read_text(file: Path, again: str) -> str:
     """Read a text file in UTF-8. Raises InputError, which ends with `again`, if it is missing, no file of text, or larger than LARGEST."""
     try:
-        if file.exists() and not file.is_file():  # a folder; a pipe or device, which may have no end
+        if _is_special(file):
             raise InputError(f"{file}: this is not a file. {again}")
         with file.open("rb") as source:
             data = source.read(LARGEST + 1)
@@ -110,8 +110,18 @@ def read_text(file: Path, again: str) -> str:
         raise InputError(f"{file}: cannot be read ({error.strerror}). {again}") from None
 
 
+def _is_special(file: Path) -> bool:
+    """Tell whether a folder is there, or a pipe or device, which may have no end."""
+    return file.exists() and not file.is_file()
+
+
 def hash_file(file: Path, kind: Callable = hashlib.blake2b) -> "hashlib._Hash":
-    """Hash the content of a file. Returns hashlib's object, which can be updated further. Raises OSError if the file cannot be read."""
+    """Hash the content of a file. Returns hashlib's object, which can be updated further.
+
+    Raises OSError if the file cannot be read, or if it is a folder, a pipe or a device.
+    """
+    if _is_special(file):
+        raise OSError(errno.EINVAL, "this is not a file", str(file))
     with open(file, "rb") as opened:
         return hashlib.file_digest(opened, kind)
 

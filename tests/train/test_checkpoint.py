@@ -7,6 +7,7 @@ from safetensors.torch import load_file, save_file
 
 from refgs.errors import InputError
 from refgs.train import checkpoint
+from tests.makers.mutants import put_link
 
 
 def test_the_last_two_are_kept(tmp_path):
@@ -75,12 +76,12 @@ def another_iteration(data, note):
 
 def endless_note(data, note):
     note.unlink()
-    note.symlink_to("/dev/zero")
+    put_link(note, "/dev/zero")
 
 
 def endless_data(data, note):
     data.unlink()
-    data.symlink_to("/dev/zero")
+    put_link(data, "/dev/zero")
 
 
 DAMAGES = [truncate, empty_note, half_a_note, no_text, no_data, not_a_number, another_shape, another_iteration]
