@@ -35,10 +35,10 @@ def even_out_due(state: State, progress: float) -> None:
     surfels = state.surfels()
     if not (metal := coloured_metal(surfels)).any():
         return
-    near = neighbours(surfels.positions, AVERAGED)
+    near = neighbours(surfels.positions, AVERAGED, metal)
     weight = (surfels.opacities * metal).view(-1, 1)
     total = pooled(weight, near).clamp_min(1e-6)
     for name in {"albedo", "roughness"} & state.parameters.keys():
         values = state.parameters[name]
         mean = pooled(weight * values.view(len(weight), -1), near) / total
-        values[metal] = mean.view_as(values)[metal]
+        values[metal] = mean.view_as(values[metal])

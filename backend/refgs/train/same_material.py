@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from scipy import sparse
 from scipy.sparse.linalg import cg
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refgs.model.surfels import Surfels
 from refgs.train.mirrored import Fit, Seen
+from refgs.train.view_dependence import neighbours
 
 # Of a surfel's error as a metal, in parts of its error as paint: it is a metal below METAL, if what it mirrors shows by SLOPE and if it
 # reflects REFLECTANCE, and paint above PAINT. Painted plastic reaches a reflectance of 0.3, most metals have more than 0.4.
@@ -89,7 +89,7 @@ def doubt(surfels: Surfels, seen: Seen, fit: Fit) -> Tensor:
 
 def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray, np.ndarray]:
     """Return the graph of surfels (N, N), which of them take part (N,), and how much photos tell that each is metal, and paint (N,)."""
-    graph, part = _laplacian(surfels.positions.double().numpy(), seen), (seen.pixels > FRINGE).double().numpy()
+    graph, part = _laplacian(surfels.positions, seen), (seen.pixels > FRINGE).double().numpy()
     ratio = fit.ratio.clamp(1e-3, 1e3).log().double().numpy() * fit.seen.numpy()
     mirrors = (fit.slope > SLOPE) & (fit.reflectance.amax(dim=1) > REFLECTANCE)
     metal = np.where(mirrors.numpy() & (ratio < np.log(METAL)), np.clip(-ratio, 0, SURE), 0) * part
@@ -106,11 +106,11 @@ def _solve(graph: sparse.csr_matrix, weight: np.ndarray, weighted: np.ndarray) -
     return cg(reach * graph + sparse.diags(weight), weighted, rtol=TOLERANCE, maxiter=STEPS)[0]
 
 
-def _laplacian(points: np.ndarray, seen: Seen) -> sparse.csr_matrix:
+def _laplacian(positions: Tensor, seen: Seen) -> sparse.csr_matrix:
     """Return the Laplacian (N, N) of the graph of neighbouring surfels."""
-    count, most = len(points), min(NEIGHBOURS + 1, len(points))
-    near = cKDTree(points).query(points, k=np.arange(1, most + 1))[1][:, 1:]
-    one, other = np.repeat(np.arange(count), most - 1), near.ravel()
+    points, near = positions.double().numpy(), neighbours(positions, NEIGHBOURS + 1)[:, 1:].numpy()
+    count = len(points)
+    one, other = np.repeat(np.arange(count), near.shape[1]), near.ravel()
     normal = seen.outward.double().numpy()
     apart = points[other] - points[one]
     apart /= np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-12)

@@ -241,16 +241,21 @@ def averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, 
     return mean, change, known
 
 
-def neighbours(positions: Tensor, most: int) -> Tensor:
-    """Return the indices (N, K) of each surfel's nearest surfels, itself among them: K is `most`, or N if there are fewer."""
+def neighbours(positions: Tensor, most: int, of: Tensor | None = None) -> Tensor:
+    """Return the indices (M, K) of each surfel's nearest surfels, itself among them: K is `most`, or N if there are fewer.
+
+    The mask `of` (N,) chooses whose are returned; all surfels' if it is None.
+    """
     points = positions.numpy(force=True)
-    count = min(most, len(points))
-    return torch.from_numpy(cKDTree(points).query(points, k=[*range(1, count + 1)])[1]).to(positions.device)
+    chosen = points if of is None else positions[of].numpy(force=True)
+    ranks = [*range(1, min(most, len(points)) + 1)]
+    near = cKDTree(points).query(chosen, k=ranks, workers=torch.get_num_threads())[1]
+    return torch.from_numpy(near).to(positions.device)
 
 
 def pooled(values: Tensor, near: Tensor) -> Tensor:
-    """Sum the rows of `values` (N, K) over each surfel's neighbours."""
-    total = torch.zeros_like(values)
+    """Sum the rows of `values` (N, …) over neighbours, as listed in `near` (M, K). Returns (M, …)."""
+    total = values.new_zeros(len(near), *values.shape[1:])
     for column in near.T:
         total += values[column]
     return total
