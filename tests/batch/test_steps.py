@@ -34,7 +34,7 @@ def test_a_capture_is_complete_where_its_files_change_no_more_whatever_the_clock
 def test_a_step_is_recorded_and_known_again(tmp_path):
     capture = nerfstudio(tmp_path / "cup", 8)
     done = step(tmp_path, "poses", capture, "--once")
-    outcome = run_step(done, 1, 0.0, ())
+    outcome = run_step(done, 1, 0.0, None, ())
     assert outcome.status == 0 and outcome.seconds > 0 and outcome.what == ""
     assert f"$ refgs poses {capture} --once\ndone before" in done.log.read_text() and not done.running.exists()
     assert recorded(done)[:3] == outcome[:3]
@@ -45,7 +45,7 @@ def test_a_step_is_recorded_and_known_again(tmp_path):
 
 
 def test_wrong_input_is_not_tried_again(tmp_path):
-    outcome = run_step(step(tmp_path, "evaluate", tmp_path / "none"), 1, 0.0, ())
+    outcome = run_step(step(tmp_path, "evaluate", tmp_path / "none"), 1, 0.0, None, ())
     assert outcome.status == 2 and outcome.what.startswith(f"{tmp_path / 'none'} is not a run folder")
     assert json.loads((tmp_path / "logs" / "cup" / "evaluate.json").read_text())["status"] == 2
 
@@ -56,7 +56,7 @@ def test_wrong_input_is_not_tried_again(tmp_path):
 )
 def test_a_step_follows_others(tmp_path, before, may_fail, runs):
     wrong = step(tmp_path, "trian")
-    outcome = run_step(wrong, 1, 0.0, (may_fail,), Outcome(before))
+    outcome = run_step(wrong, 1, 0.0, None, (may_fail,), Outcome(before))
     assert (outcome.status, wrong.log.exists()) == ((2, True) if runs else (None, False))
 
 
@@ -67,14 +67,14 @@ def test_a_full_disk_is_tried_again(tmp_path, small_disk):
     there.log.touch()
     fill(small_disk / "filler")
     with pytest.raises(TryLater, match="No space left"):
-        run_step(there, 1, 0.0, ())
+        run_step(there, 1, 0.0, None, ())
     with open(small_disk / "filler", "r+b") as file:
         file.truncate(file.seek(0, os.SEEK_END) - 4096)  # room for the command's own line, and not for what it says
     there.log.write_bytes(bytes(4096 - len(f"$ refgs {' '.join(there.words)}\n")))
     with pytest.raises(TryLater, match="75"):
-        run_step(there, 1, 0.0, ())
+        run_step(there, 1, 0.0, None, ())
     (small_disk / "filler").unlink()
-    assert run_step(there, 1, 0.0, ()).status == 0
+    assert run_step(there, 1, 0.0, None, ()).status == 0
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
@@ -102,6 +102,6 @@ def test_a_killed_command_is_tried_again(ball_capture, tmp_path, victim):
 
 def _run(step: Step, said: Path) -> None:
     try:
-        run_step(step, 1, 0.0, ())
+        run_step(step, 1, 0.0, None, ())
     except TryLater as error:
         said.write_text(str(error))

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -215,7 +215,9 @@ def ready(
             (out / LOGS).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{out}: the folder cannot be made ({error.strerror}): choose another") from None
-        with RunLock(out / LOGS) as lock, disk_errors_named([out], "run the same command again"):
+        again = "run the same command again"
+        lent = engine.lending(out.resolve() / LOGS) if address else nullcontext()
+        with RunLock(out / LOGS) as lock, disk_errors_named([out], again), lent:
             yield lambda stop: work.run(engine, lambda *facts: lock.attend(*facts) or stop())
 
 

@@ -20,6 +20,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from refgs.batch.copies import Depot, remove_copies
 from refgs.batch.steps import Outcome, Step, TryLater, run_step
 from refgs.errors import TRY_AGAIN, InputError, TryAgain
 
@@ -32,6 +33,8 @@ SILENCE = 20.0  # seconds without an answer after which the head is taken to be 
 LOCKED, NEW = "refgs.lock", 60.0  # a file in Ray's folder, and the seconds that a batch has to lock it
 JOIN = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False, logging_level='CRITICAL')"
 STORE = 80 << 20  # bytes of Ray's object store: steps hand on files, not objects
+MARK, READERS = "shared-", 8  # the first letters of a file that shows who shares the runs; machines that copy at once
+TIDY = 10.0  # seconds for machines to remove their copies
 ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",  # tell nobody
     "RAY_worker_niceness": "0",  # commands run as fast as without Ray
@@ -44,14 +47,20 @@ class Engine:
     """Run steps by Ray. A step starts when those before it have ended and a machine has what it needs."""
 
     def __init__(self, ray: Any, cores: int):
-        """Look at the machines of a Ray that has been started. `cores` is the number of cores of each step."""
-        self._ray = ray
+        """Look at the machines of a Ray that has been started. `cores` is the number of cores of each step.
+
+        Raises InputError if no machine has cores.
+        """
+        self._ray, self._depot = ray, None
         self._steps: dict[Any, Step] = {}
+        self._roots: set[Path] = set()
         self._run = ray.remote(run_step)
         host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
         self._head, self._heard = (host.strip("[]"), int(port)), time.monotonic()
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         self._cores = min(cores, int(max(node.get("CPU", 0) for node in nodes)))
+        if not self._cores:
+            raise InputError("no machine of the cluster lends cores: start one with ray start --address=HOST:PORT")
         self._memory = int(max(node.get("memory", 0) for node in nodes))
         self.cards = int(max(node.get("GPU", 0) for node in nodes))
 
@@ -74,8 +83,9 @@ class Engine:
             "name": f"{step.run} {step.name}",
         }
         outcomes, optional = zip(*before, strict=True) if before else ((), ())
-        reference = self._run.options(**how).remote(step, self._cores, PAUSE, optional, *outcomes)
+        reference = self._run.options(**how).remote(step, self._cores, PAUSE, self._depot, optional, *outcomes)
         self._steps[reference] = step
+        self._roots |= {*step.reads, *step.writes, step.log.parent}
         return reference
 
     def ended(self, seconds: float) -> Iterator[tuple[Step, Outcome]]:
@@ -122,7 +132,38 @@ class Engine:
     def cancel(self) -> None:
         """End all steps: those that run write a checkpoint first."""
         for reference in self._steps:
-            self._ray.cancel(reference)
+            self._ray.cancel(reference, recursive=False)  # and not what copies their files back
+
+    @contextmanager
+    def lending(self, folder: Path) -> Iterator[None]:
+        """Have the files of all steps copied, for a `with` block, to machines that do not share `folder`, that of the batch's logs.
+
+        After the block, the copies are removed; if it raises an error, they stay for the next batch.
+        """
+        for old in folder.glob(f"{MARK}*"):
+            old.unlink()
+        mark = folder / f"{MARK}{secrets.token_hex(8)}"  # a new name: no machine remembers that there is no such file
+        mark.touch()
+        here = self._ray.get_runtime_context().get_node_id()
+        how = {"num_cpus": 0, "scheduling_strategy": _on(here), "max_concurrency": READERS}
+        self._depot = self._ray.remote(Depot).options(**how).remote(mark)
+        try:
+            yield
+            nodes = [node["NodeID"] for node in self._ray.nodes() if node["Alive"] and node["NodeID"] != here]
+            remove = self._ray.remote(remove_copies)
+            how = [{"num_cpus": 0, "scheduling_strategy": _on(node)} for node in nodes]
+            gone = [remove.options(**one).remote([*self._roots], mark) for one in how]
+            if gone:
+                self._ray.wait(gone, num_returns=len(gone), timeout=TIDY)
+        finally:
+            mark.unlink(missing_ok=True)
+
+
+def _on(node: str) -> Any:
+    """Return Ray's strategy for a task that must run on one machine."""
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    return NodeAffinitySchedulingStrategy(node, soft=False)
 
 
 def _card_bytes() -> int:

@@ -1,5 +1,6 @@
 """Make the steps of a training: find cameras, make masks, train, evaluate, export. Each is a command line that can be repeated."""
 
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,16 +26,21 @@ def steps_of(job: Job, out: Path, device: str) -> list[Node]:
     Masks may fail: the training then takes all that the photos show, as `refgs train` does. No two steps work in the run at once: each
     that locks it removes what others are writing, as if killed processes had left it.
     """
-    run, capture = (out / job.name).resolve(), str(job.capture)
+    run, capture, ask = (out / job.name).resolve(), str(job.capture), job.ask
     logs = run.parent / LOGS
+    preset, files = ask.preset, ()
+    if preset and os.path.isfile(preset):
+        preset = os.path.realpath(preset)
+        files = (Path(preset),)
 
     def step(name: str, *words: str, made: Path | None = None) -> Step:
-        owner = job.capture_name if name in SHARED else job.name
-        return Step(name, owner, (name, *words, "--once"), logs / owner / f"{name}.log", made)
+        owner, folders = (
+            (job.capture_name, ((), (job.capture,))) if name in SHARED else (job.name, ((job.capture, *files), (run,)))
+        )
+        return Step(name, owner, (name, *words, "--once"), logs / owner / f"{name}.log", made, *folders)
 
-    ask = job.ask
     how = [
-        *(("--preset", ask.preset) if ask.preset else ()),
+        *(("--preset", preset) if preset else ()),
         *(("--minutes", f"{ask.minutes:g}") if ask.minutes else ()),
     ]
     how += [word for change in ask.set for word in ("--set", change)]

@@ -10,8 +10,9 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from refgs.batch.copies import at_hand
 from refgs.errors import InputError, TryAgain
 from refgs.paths import disk_errors_named, write_text
 
@@ -22,7 +23,8 @@ FAILED = (1, 2)  # exit statuses after which a retry is useless
 class Step(NamedTuple):
     """Describe a step: its `name`, such as "train", the `run` it belongs to, and the `words` of its command after `refgs`.
 
-    `log` is the file for what it prints; the record is beside it. `made` is a file that is there once it is done, if there is one.
+    `log` is the file for what it prints; the record is beside it. `made` is a file that is there once it is done, if there is one. `reads`
+    and `writes` are the files and folders that it works with, apart from the log's.
     """
 
     name: str
@@ -30,6 +32,8 @@ class Step(NamedTuple):
     words: tuple[str, ...]
     log: Path
     made: Path | None = None
+    reads: tuple[Path, ...] = ()
+    writes: tuple[Path, ...] = ()
 
     @property
     def running(self) -> Path:
@@ -67,21 +71,25 @@ def recorded(step: Step) -> Outcome | None:
     return Outcome(found.status, found.seconds, found.node) if same and there else None
 
 
-def run_step(step: Step, cores: int, pause: float, optional: tuple[bool, ...], *before: Outcome) -> Outcome:
+def run_step(step: Step, cores: int, pause: float, depot: Any, optional: tuple[bool, ...], *before: Outcome) -> Outcome:
     """Run a step and record its outcome beside its log. A step that follows a failed one is not run.
 
-    `cores` is the number of threads. `before` are the outcomes of the steps that it follows, and `optional` says which of these may fail.
+    `cores` is the number of threads. `depot` has the files, if this may be another machine than the batch's; otherwise it is None. `before`
+    are the outcomes of the steps that it follows, and `optional` says which of these may fail.
     If the command says that it may succeed later, if it was killed, or if the log or the record cannot be written, wait `pause` seconds and
     raise TryLater.
     """
     if any(outcome.status != 0 and not may_fail for outcome, may_fail in zip(before, optional, strict=True)):
         return Outcome(None)
     try:
-        with disk_errors_named([], "run the batch again"):
+        folders = step.reads, (*step.writes, step.log.parent)
+        with disk_errors_named([], "run the batch again"), at_hand(*folders, depot):
             outcome = _run_and_record(step, cores)
     except TryAgain as error:
         time.sleep(pause)
         raise TryLater(str(error)) from None
+    except InputError as error:
+        return Outcome(2, node=platform.node(), what=str(error))
     if outcome.status and outcome.status not in FAILED:
         time.sleep(pause)
         raise TryLater(outcome.what)

@@ -1,0 +1,233 @@
+"""Copy a step's files to a machine of a cluster that shares no folder with the batch's, and copy back what the step makes.
+
+A copy has the path of what it copies, for commands and run folders name files by their paths. The bytes go through Ray's object store.
+"""
+
+import os
+import platform
+import shutil
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+
+from refgs.errors import InputError, TryAgain
+from refgs.paths import is_leftover, whole
+
+EVERY = 5.0  # seconds from one copying back to the next while a step runs: what a machine's death costs
+PART = 32 << 20  # bytes that are sent at once
+NOT_COPIED = ("run.lock",)  # it holds on one machine only
+
+Listing = dict[str, tuple[int, int]]
+"""The files in a folder: size in bytes, and time of the last change in nanoseconds, by their paths in it."""
+
+
+def list_files(root: Path) -> Listing:
+    """List the files in a folder and in those that it links to. A file is listed under the name "."; what is not there has no files."""
+    if root.is_file():
+        return {".": _facts(root)}
+    found, seen = {}, set()
+    for folder, folders, files in os.walk(root, followlinks=True):
+        if (real := os.path.realpath(folder)) in seen:  # a link to a folder above
+            folders.clear()
+            continue
+        seen.add(real)
+        for file in (Path(folder, name) for name in files if name not in NOT_COPIED):
+            with suppress(FileNotFoundError):  # it was renamed or removed meanwhile
+                if file.is_file() and not is_leftover(file):
+                    found[file.relative_to(root).as_posix()] = _facts(file)
+    return found
+
+
+def _facts(file: Path) -> tuple[int, int]:
+    facts = file.stat()
+    return facts.st_size, facts.st_mtime_ns
+
+
+class Depot:
+    """Read and write files of the batch's machine for steps on others. Ray runs it as an actor there."""
+
+    def __init__(self, mark: Path):
+        """Remember `mark`, a file: who sees it shares the folder of the batch with this machine."""
+        self._mark, self._tickets = mark, Counter()
+
+    def begin(self, roots: tuple[Path, ...]) -> tuple[Path, dict[Path, int]]:
+        """Return the mark, and tickets for writing in folders. Earlier ones for them, of steps that Ray has given up, count no more."""
+        self._tickets.update(roots)
+        return self._mark, {root: self._tickets[root] for root in roots}
+
+    def listing(self, root: Path) -> Listing:
+        """List the files in a folder."""
+        return list_files(root)
+
+    def read(self, file: Path, start: int) -> bytes:
+        """Return the next PART bytes of a file; fewer at its end."""
+        with open(file, "rb") as opened:
+            opened.seek(start)
+            return opened.read(PART)
+
+    def write(self, root: Path, ticket: int, name: str, parts: list[Any], time: int) -> None:
+        """Write a file completely or not at all. `parts` are references to its bytes, `time` is its time of change in nanoseconds."""
+        self._check(root, ticket)
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        _write(root / name, map(_get, parts), time)
+
+    def remove(self, root: Path, ticket: int, names: list[str]) -> None:
+        """Remove files that the step has removed."""
+        self._check(root, ticket)
+        for name in names:
+            (root / name).unlink(missing_ok=True)
+
+    def _check(self, root: Path, ticket: int) -> None:
+        if ticket != self._tickets[root]:
+            raise TryAgain(f"{root}: the step was started again on another machine")
+
+
+@contextmanager
+def at_hand(reads: tuple[Path, ...], writes: tuple[Path, ...], depot: Any) -> Iterator[None]:
+    """Have files and folders of the batch's machine here for a `with` block, and what the block writes there.
+
+    Where the folder of the batch is shared, and without a `depot`, nothing is copied. Otherwise, the files are copied before the block, and
+    what has changed in `writes` is copied back while it runs, and after it. The copies stay, for the next step: see `remove_copies`.
+
+    Raises InputError if a folder is here, is no copy, and has other files, and TryAgain if the batch's machine does not answer.
+    """
+    if depot is None:
+        yield
+        return
+    mark, tickets = _get(depot.begin.remote(writes))
+    if mark.exists():
+        yield
+        return
+    mark.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(mark.parent / "copies.lock"):  # steps of one capture copy it once
+        there = {root: _fetch(root, depot) for root in (*reads, *writes)}
+    back = _Back({root: (ticket, there[root]) for root, ticket in tickets.items()}, depot)
+    try:
+        yield
+    finally:
+        back.end()
+
+
+def remove_copies(roots: list[Path], mark: Path) -> None:
+    """Remove the copies that this machine has of files and folders of a batch. `mark` is that of the batch's machine."""
+    if mark.exists():
+        return
+    for root in roots:
+        if _mark(root).exists():
+            shutil.rmtree(root) if root.is_dir() else root.unlink(missing_ok=True)
+            _mark(root).unlink()
+    with suppress(OSError):  # not empty, or never made
+        (mark.parent / "copies.lock").unlink()
+    for empty in {mark.parent, *(root.parent for root in roots)}:
+        with suppress(OSError):
+            os.removedirs(empty)
+
+
+def _mark(root: Path) -> Path:
+    """Return the file that marks a folder of this machine as a copy. It is beside the folder, for what is in it is the step's."""
+    return root.with_name(f".{root.name}.refgs-copy")
+
+
+def _fetch(root: Path, depot: Any) -> Listing:
+    """Make the copy of a file or folder like what it copies. Returns the listing of both."""
+    there, here = _get(depot.listing.remote(root)), list_files(root)
+    if not _mark(root).exists():
+        if here and here == there:  # this folder is shared
+            return there
+        if here:
+            what = f"{platform.node()}: {root} is another one than where the batch runs"
+            raise InputError(f"{what}: move it away, or share the folder with all machines")
+        root.parent.mkdir(parents=True, exist_ok=True)
+        _mark(root).touch()
+    for name in here.keys() - there.keys():
+        (root / name).unlink()
+    for name, facts in there.items():
+        if here.get(name) != facts:
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            _write(root / name, _parts(root / name, depot), facts[1])
+    return there
+
+
+def _parts(file: Path, depot: Any) -> Iterator[bytes]:
+    for start in count(0, PART):
+        part = _get(depot.read.remote(file, start))
+        yield part
+        if len(part) < PART:
+            return
+
+
+def _write(file: Path, parts: Iterator[bytes], time: int) -> None:
+    with whole(file, durable=False) as temporary:
+        with open(temporary, "wb") as opened:
+            for part in parts:
+                opened.write(part)
+        os.utime(temporary, ns=(time, time))
+
+
+class _Back:
+    """Copy back what changes in folders, until `end` is called. It has a thread, for Ray interrupts steps that are stopped."""
+
+    def __init__(self, folders: dict[Path, tuple[int, Listing]], depot: Any):
+        """`folders` are the tickets of the folders, and what the batch's machine has in each."""
+        self._folders, self._depot, self._error = folders, depot, None
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """Copy for the last time. Raises what copying raised."""
+        self._over.set()
+        while self._thread.is_alive():
+            with suppress(KeyboardInterrupt):  # Ray says more than once that a step is to stop
+                self._thread.join()
+        if self._error:
+            raise self._error
+
+    def _work(self) -> None:
+        try:
+            while not self._over.wait(EVERY):
+                self._copy()
+            self._copy()
+        except Exception as error:
+            self._error = error
+
+    def _copy(self) -> None:
+        for root, (ticket, there) in self._folders.items():
+            here = list_files(root)
+            changed = [(facts, name) for name, facts in here.items() if there.get(name) != facts]
+            # In the order in which they were written: the file that says that a run is complete comes last.
+            for facts, name in sorted(changed, key=lambda one: (one[0][1], one[1])):
+                with suppress(FileNotFoundError):  # it was removed meanwhile
+                    self._send(root, ticket, name, facts[1])
+                    there[name] = facts
+            if gone := [name for name in there if name not in here]:
+                _get(self._depot.remove.remote(root, ticket, gone))
+                for name in gone:
+                    del there[name]
+
+    def _send(self, root: Path, ticket: int, name: str, time: int) -> None:
+        import ray
+
+        parts = []
+        with open(root / name, "rb") as file:
+            while part := file.read(PART):
+                parts.append(ray.put(part))
+        _get(self._depot.write.remote(root, ticket, name, parts, time))
+
+
+def _get(reference: Any) -> Any:
+    """Wait for a value. Raises what made it fail, and TryAgain if the machine that has it does not answer."""
+    import ray
+
+    try:
+        return ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from None
+    except ray.exceptions.RayError as error:
+        raise TryAgain(f"the batch's machine does not answer ({type(error).__name__})") from None
