@@ -1,3 +1,5 @@
+import tracemalloc
+
 import numpy as np
 import OpenEXR
 import pytest
@@ -26,6 +28,18 @@ def test_the_file_says_what_it_is(tmp_path):
         assert header["compression"] == OpenEXR.ZIP_COMPRESSION
         rec709 = 0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329
         np.testing.assert_allclose(header["chromaticities"], rec709, rtol=1e-6)
+
+
+def test_a_panorama_takes_twice_its_memory_while_it_is_read(tmp_path):
+    """Check that the pixels are held twice, as channels and as a picture, and not more often: one of 8192×4096 has 400 MB."""
+    write_exr(tmp_path / "e.exr", RNG.normal(size=(256, 512, 3)).astype(np.float32))
+    read_environment(tmp_path / "e.exr")
+    tracemalloc.start()
+    try:
+        read = read_environment(tmp_path / "e.exr")
+        assert tracemalloc.get_traced_memory()[1] < 2.3 * read.nbytes
+    finally:
+        tracemalloc.stop()
 
 
 def test_of_several_parts_the_first_in_colour_is_read(tmp_path):

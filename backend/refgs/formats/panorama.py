@@ -24,9 +24,11 @@ def read_environment(path: str | os.PathLike) -> np.ndarray:
     height, width = pixels.shape[:2]
     if width != 2 * height:
         raise InputError(f"{path} is {width}×{height}: an equirectangular panorama is twice as wide as it is high")
-    if missing := int(np.isnan(pixels[..., :3]).any(axis=-1).sum()):
+    radiance = np.ascontiguousarray(pixels[..., :3])
+    if missing := int(np.isnan(radiance).any(axis=-1).sum()):
         warnings.warn(InputWarning(f"{path}: {missing:,} pixels are not a number and give no light"), stacklevel=2)
-    return np.nan_to_num(pixels[..., :3], nan=0, posinf=65504, neginf=0).clip(min=0)
+    np.nan_to_num(radiance, copy=False, nan=0, posinf=65504, neginf=0)
+    return np.maximum(radiance, 0, out=radiance)
 
 
 def _read_radiance(path: Path) -> np.ndarray:
