@@ -7,8 +7,9 @@ import pytest
 
 from refgs.errors import TRY_AGAIN
 from refgs.lock import RunLock
-from refgs.paths import whole, write_text
+from refgs.paths import read_bytes, whole, write_text
 from tests.makers.disk import fill
+from tests.makers.mutants import put_link
 
 
 def test_two_writers_of_a_file_do_not_share_what_is_not_complete(tmp_path):
@@ -94,3 +95,10 @@ def test_a_lock_that_a_signal_interrupts_is_not_left(tmp_path, monkeypatch, when
     monkeypatch.undo()
     with RunLock(tmp_path):
         pass
+
+
+@pytest.mark.parametrize("other", ["", "/dev/zero"])
+def test_what_is_no_file_is_not_read(tmp_path, other):
+    put_link(tmp_path / "a", other)
+    with pytest.raises(OSError, match="this is not a file"):
+        read_bytes(tmp_path / "a")

@@ -120,10 +120,20 @@ def hash_file(file: Path, kind: Callable = hashlib.blake2b) -> "hashlib._Hash":
 
     Raises OSError if the file cannot be read, or if it is a folder, a pipe or a device.
     """
-    if _is_special(file):
-        raise OSError(errno.EINVAL, "this is not a file", str(file))
+    _check_ordinary(file)
     with open(file, "rb") as opened:
         return hashlib.file_digest(opened, kind)
+
+
+def read_bytes(file: Path) -> bytes:
+    """Read a file. Raises OSError if it cannot be read, or if it is a folder, a pipe or a device."""
+    _check_ordinary(file)
+    return file.read_bytes()
+
+
+def _check_ordinary(file: Path) -> None:
+    if _is_special(file):
+        raise OSError(errno.EINVAL, "this is not a file", str(file))
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from refgs.formats.panorama import directions
 from refgs.train import history
 from tests.makers import scenes
 from tests.makers.ball import dusk
+from tests.makers.mutants import put_link
 from tests.makers.training import TINY, put, trainer
 
 
@@ -116,6 +117,16 @@ def test_a_resumed_run_records_the_same(ball_capture, tmp_path, monkeypatch):
     assert whole == cut and whole[-1]["iteration"] == 40 and "flip_test" in whole[3]
     before, after = (row["parts"] for row in rows(tmp_path / "cut")[3:5])
     assert all(after[name] >= before[name] - 1e-4 for name in before), "time is counted on"
+
+
+@pytest.mark.parametrize("other", ["", "/dev/zero"])
+def test_what_is_no_file_is_set_aside(tmp_path, other):
+    """Put a folder or a link to an endless device in the place of a history. Check that a resumed training has a new one."""
+    put_link(tmp_path / "history.jsonl", other)
+    said = []
+    history.trim(tmp_path, 20, lambda event, facts: said.append((event, facts["what"])))
+    assert len(said) == 1 and said[0][0] == "warning" and "cannot be read and is set aside as *.damaged" in said[0][1]
+    assert not (tmp_path / "history.jsonl").exists() and (tmp_path / "history.jsonl.damaged").exists()
 
 
 def test_a_training_that_is_ended_early_has_a_last_line(ball_capture, tmp_path):

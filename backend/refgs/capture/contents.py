@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from refgs.errors import InputError
-from refgs.paths import hash_file, write_text
+from refgs.paths import hash_file, read_bytes, write_text
 
 FILE = "capture.json"  # in the run folder
 _HASHES = TypeAdapter(dict[str, str])
@@ -31,7 +31,7 @@ def write_hashes(run: Path, hashes: dict[str, str]) -> None:
 def changed_files(run: Path, hashes: dict[str, str]) -> list[str]:
     """Return the files whose hashes are not those in a run's folder, by their paths. Runs of earlier releases have no hashes."""
     try:
-        known = _HASHES.validate_json((run / FILE).read_bytes())
+        known = _HASHES.validate_json(read_bytes(run / FILE))
     except (OSError, ValidationError):
         return []
     return [name for name, hashed in hashes.items() if known.get(name, hashed) != hashed]

@@ -5,6 +5,8 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from refgs.paths import read_bytes
+
 FILE = "history.jsonl"  # in the run folder
 
 _Number = Annotated[int, Field(ge=-(2**53), le=2**53)] | float | None
@@ -25,7 +27,7 @@ def read(file: Path) -> tuple[list[dict], int]:
     file cannot be read.
     """
     found, damaged = [], 0
-    for line in file.read_bytes().split(b"\n"):
+    for line in read_bytes(file).split(b"\n"):
         if line.strip():
             try:
                 found.append(_Line.model_validate_json(line).model_dump(exclude_unset=True))

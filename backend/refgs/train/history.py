@@ -2,11 +2,15 @@
 
 import json
 import math
+import os
+from contextlib import suppress
 from pathlib import Path
 
+from refgs.errors import reason
 from refgs.events import Report
 from refgs.formats.history import FILE, damage, read
 from refgs.paths import write_text
+from refgs.train.checkpoint import DAMAGED
 from refgs.train.measures import Measures
 from refgs.train.state import State
 
@@ -69,12 +73,19 @@ def record(state: State, measures: Measures, loss: float, quality: float) -> Non
 def trim(folder: Path, iteration: int, report: Report) -> None:
     """Remove from the history the lines of iterations after `iteration`, because the training will do these iterations again.
 
-    Damaged lines are removed, too, and reported.
+    Damaged lines are removed, too, and reported. What cannot be read in its place is set aside, and reported.
     """
     file = folder / FILE
-    if file.exists():
+    try:
         lines, damaged = read(file)
-        kept = [line for line in lines if (line.get("iteration") or math.inf) <= iteration]
-        write_text(file, "".join(json.dumps(line) + "\n" for line in kept))
-        if damaged:
-            report("warning", {"what": damage(damaged)})
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        with suppress(OSError):  # in a folder that is read-only
+            os.replace(file, file.with_name(FILE + DAMAGED))
+        report("warning", {"what": f"{file} cannot be read and is set aside as *{DAMAGED}: {reason(error)}"})
+        return
+    kept = [line for line in lines if (line.get("iteration") or math.inf) <= iteration]
+    write_text(file, "".join(json.dumps(line) + "\n" for line in kept))
+    if damaged:
+        report("warning", {"what": damage(damaged)})
