@@ -410,6 +410,7 @@ def test_raw_that_cannot_be_read(tmp_path):
         ("other.cr3", b"something else" * 100, "does not know this camera's RAW"),
         ("empty.nef", b"", "broken"),
         ("cut.dng", data[: len(data) // 2], "truncated or broken"),
+        ("type.dng", data[:76] + b"\x43" + data[77:], "too little memory"),  # a field of TIFF of an unknown type
     ):
         (tmp_path / name).write_bytes(content)
         view = View(

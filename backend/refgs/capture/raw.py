@@ -90,8 +90,10 @@ def _reading(path: Path) -> Iterator[None]:
         raise InputError(
             f"{path}: LibRaw does not know this camera's RAW, or the file is broken. Copy it again, or save it as DNG or 16-bit TIFF."
         ) from error
-    except rawpy.LibRawUnsufficientMemoryError as error:
-        raise MemoryError from error
+    except rawpy.LibRawUnsufficientMemoryError as error:  # which a broken file's numbers bring about, too
+        raise InputError(
+            f"{path}: LibRaw finds too little memory for the RAW photo. Close other programs, or copy it again if it is broken."
+        ) from error
     except rawpy.LibRawError as error:
         said = error.args[0] if error.args else type(error).__name__
         said = said.decode() if isinstance(said, bytes) else said
