@@ -361,12 +361,15 @@ def batch(
     ask = Ask(preset=preset, minutes=minutes, set=changes)
     with (
         _batch_bars() as report,
+        _signals_to_stop(None, BATCH_END_BY) as stopped,  # also while Ray starts and ends
         ready(source, out, ask, device, report, cores, workers, address) as run,
-        _signals_to_stop(None, BATCH_END_BY) as stopped,
     ):
         status = run(lambda: bool(stopped))
     console.print(f"the page about all runs: {out / PAGE}")
     if stopped and status:
+        signal.signal(
+            signal.SIGTERM, signal.SIG_IGN
+        )  # one that comes now, while Python ends, must not change the status
         _end(stopped)
     sys.exit(status)
 

@@ -1,8 +1,10 @@
 """Start batches in processes of their own, and wait for them."""
 
+import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 
 from tests.makers import processes
 
@@ -10,11 +12,25 @@ PATIENCE = 240.0  # seconds
 
 
 def batch(source, out, *words) -> subprocess.Popen:
-    """Start `refgs batch` in a session of its own, on the CPU. Its output is in its pipe `stdout`."""
+    """Start `refgs batch` in a session of its own, on the CPU. Its output is in its pipe `stdout`.
+
+    It ignores SIGINT at first, as in the background of a shell script.
+    """
     command = [sys.executable, "-m", "refgs.cli", "batch", source, "--out", out, "--device", "cpu", *words]
-    return subprocess.Popen(
-        list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
-    )
+    with ignored(signal.SIGINT):
+        return subprocess.Popen(
+            list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+        )
+
+
+@contextmanager
+def ignored(number: signal.Signals):
+    """Ignore a signal for a `with` block. Processes that it starts ignore it, too, unless they handle it."""
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
 
 
 def until(process, condition):

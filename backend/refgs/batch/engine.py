@@ -197,7 +197,22 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
         yield Engine(ray, cores)
     finally:
         with _signals(signal.SIG_IGN):  # stopped half way, Ray waits for a minute and ends this process with 1
+            _keep_ignoring(ray)
             ray.shutdown()
+
+
+def _keep_ignoring(ray: Any) -> None:
+    """Ignore SIGTERM again half way through Ray's shutdown: with its log, Ray gives SIGTERM back to the system, to which it means death."""
+    node = ray._private.worker._global_node
+    if node is None or threading.current_thread() is not threading.main_thread():
+        return
+    kill = node.kill_all_processes
+
+    def ignore_and_kill(*words: Any, **more: Any) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        kill(*words, **more)
+
+    node.kill_all_processes = ignore_and_kill
 
 
 @contextmanager

@@ -6,6 +6,7 @@ Ray's workers import this module. It imports little, so that they start soon.
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 import time
@@ -81,6 +82,9 @@ def run_step(step: Step, cores: int, pause: float, depot: Any, optional: tuple[b
     """
     if any(outcome.status != 0 and not may_fail for outcome, may_fail in zip(before, optional, strict=True)):
         return Outcome(None)
+    # Ray stops a step by SIGINT, which Python ignores if the batch was started in the background of a shell script.
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         folders = step.reads, (*step.writes, step.log.parent)
         with disk_errors_named([], "run the batch again"), at_hand(*folders, depot):
