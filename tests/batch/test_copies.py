@@ -161,6 +161,7 @@ def test_what_a_step_writes_is_copied_back_and_nothing_else(apart, tmp_path):
     (there / "cup" / "images").mkdir(parents=True)
     (there / "cup" / "images" / "a.png").write_bytes(bytes(range(256)))
     (there / "cup" / "again").symlink_to(".")  # a circle
+    (there / "cup" / "photos").symlink_to("images")
     (there / "runs" / "cup").mkdir(parents=True)
     (there / "runs" / "cup" / "old").write_text("old")
     depot = apart()
@@ -174,9 +175,12 @@ def test_what_a_step_writes_is_copied_back_and_nothing_else(apart, tmp_path):
         (there / "runs" / "cup" / "added").touch()  # meanwhile, by somebody else
     assert list_files(there / "runs" / "cup").keys() == {"sub/new", "added"}
     assert (there / "runs" / "cup" / "sub" / "new").read_text() == "new"
-    assert list_files(there / "cup").keys() == {"images/a.png"}
+    assert list_files(there / "cup").keys() == {"images/a.png", "photos/a.png"}
     with at_hand((capture,), (run,), depot):  # the copies become like what they copy
-        assert list_files(capture).keys() == {"images/a.png"} and list_files(run).keys() == {"sub/new", "added"}
+        assert list_files(capture).keys() == {"images/a.png", "photos/a.png"} and list_files(run).keys() == {
+            "sub/new",
+            "added",
+        }
         assert list_files(run) == list_files(there / "runs" / "cup")
     remove_copies([capture, run], tmp_path / "logs" / "shared-1")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["there"]

@@ -17,11 +17,11 @@ from typing import Any
 from filelock import FileLock
 
 from refgs.errors import InputError, TryAgain
+from refgs.lock import LOCK
 from refgs.paths import is_leftover, whole
 
 EVERY = 5.0  # seconds from one copying back to the next while a step runs: what a machine's death costs
 PART = 32 << 20  # bytes that are sent at once
-NOT_COPIED = ("run.lock",)  # it holds on one machine only
 
 Listing = dict[str, tuple[int, int]]
 """The files in a folder: size in bytes, and time of the last change in nanoseconds, by their paths in it."""
@@ -31,13 +31,12 @@ def list_files(root: Path) -> Listing:
     """List the files in a folder and in those that it links to. A file is listed under the name "."; what is not there has no files."""
     if root.is_file():
         return {".": _facts(root)}
-    found, seen = {}, set()
+    found = {}
     for folder, folders, files in os.walk(root, followlinks=True):
-        if (real := os.path.realpath(folder)) in seen:  # a link to a folder above
+        if os.path.realpath(folder) in map(os.path.realpath, Path(folder).parents):  # a link to a folder above
             folders.clear()
             continue
-        seen.add(real)
-        for file in (Path(folder, name) for name in files if name not in NOT_COPIED):
+        for file in (Path(folder, name) for name in files if name != LOCK):  # it holds on one machine only
             with suppress(FileNotFoundError):  # it was renamed or removed meanwhile
                 if file.is_file() and not is_leftover(file):
                     found[file.relative_to(root).as_posix()] = _facts(file)
