@@ -367,9 +367,8 @@ def batch(
         status = run(lambda: bool(stopped))
     console.print(f"the page about all runs: {out / PAGE}")
     if stopped and status:
-        signal.signal(
-            signal.SIGTERM, signal.SIG_IGN
-        )  # one that comes now, while Python ends, must not change the status
+        # One that comes now, while Python ends, must not change the status.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
         _end(stopped)
     sys.exit(status)
 

@@ -85,7 +85,7 @@ class Engine:
         outcomes, optional = zip(*before, strict=True) if before else ((), ())
         reference = self._run.options(**how).remote(step, self._cores, PAUSE, self._depot, optional, *outcomes)
         self._steps[reference] = step
-        self._roots |= {*step.reads, *step.writes, step.log.parent}
+        self._roots |= {*step.reads, *step.writes}
         return reference
 
     def ended(self, seconds: float) -> Iterator[tuple[Step, Outcome]]:

@@ -34,10 +34,12 @@ def steps_of(job: Job, out: Path, device: str) -> list[Node]:
         files = (Path(preset),)
 
     def step(name: str, *words: str, made: Path | None = None) -> Step:
-        owner, folders = (
-            (job.capture_name, ((), (job.capture,))) if name in SHARED else (job.name, ((job.capture, *files), (run,)))
-        )
-        return Step(name, owner, (name, *words, "--once"), logs / owner / f"{name}.log", made, *folders)
+        if name in SHARED:
+            owner, reads, written = job.capture_name, (), job.capture
+        else:
+            owner, reads, written = job.name, (job.capture, *files), run
+        log = logs / owner / f"{name}.log"
+        return Step(name, owner, (name, *words, "--once"), log, made, reads, (written, log.parent))
 
     how = [
         *(("--preset", preset) if preset else ()),

@@ -25,7 +25,7 @@ class Step(NamedTuple):
     """Describe a step: its `name`, such as "train", the `run` it belongs to, and the `words` of its command after `refgs`.
 
     `log` is the file for what it prints; the record is beside it. `made` is a file that is there once it is done, if there is one. `reads`
-    and `writes` are the files and folders that it works with, apart from the log's.
+    and `writes` are the files and folders that it works with; the log's is written.
     """
 
     name: str
@@ -77,6 +77,7 @@ def run_step(step: Step, cores: int, pause: float, depot: Any, optional: tuple[b
 
     `cores` is the number of threads. `depot` has the files, if this may be another machine than the batch's; otherwise it is None. `before`
     are the outcomes of the steps that it follows, and `optional` says which of these may fail.
+
     If the command says that it may succeed later, if it was killed, or if the log or the record cannot be written, wait `pause` seconds and
     raise TryLater.
     """
@@ -86,8 +87,7 @@ def run_step(step: Step, cores: int, pause: float, depot: Any, optional: tuple[b
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        folders = step.reads, (*step.writes, step.log.parent)
-        with disk_errors_named([], "run the batch again"), at_hand(*folders, depot):
+        with disk_errors_named([], "run the batch again"), at_hand(step.reads, step.writes, depot):
             outcome = _run_and_record(step, cores)
     except TryAgain as error:
         time.sleep(pause)

@@ -77,12 +77,17 @@ def load(folder: Path, report: Report = lambda event, facts: None) -> tuple[dict
             return _read(folder, iteration)
         except (InputError, OSError, ValueError, KeyError, RecursionError, SafetensorError) as error:
             for file in _files(folder, iteration):
-                with suppress(OSError):  # not there, or in a folder that is read-only
-                    os.replace(file, file.with_name(file.name + DAMAGED))
+                set_aside(file)
             damaged = f"the checkpoint of iteration {iteration} is damaged and set aside as *{DAMAGED}"
             what = f"{folder}: {damaged}: {reason(error)}"
             report("warning", {"what": what})
     raise NoCheckpoint(f"{folder} holds no complete checkpoint: train without --resume into a new folder")
+
+
+def set_aside(file: Path) -> None:
+    """Rename a file that cannot be read: DAMAGED is added to its name. Do nothing if it is not there, or in a folder that is read-only."""
+    with suppress(OSError):
+        os.replace(file, file.with_name(file.name + DAMAGED))
 
 
 def _begun(folder: Path) -> list[int]:

@@ -2,15 +2,13 @@
 
 import json
 import math
-import os
-from contextlib import suppress
 from pathlib import Path
 
 from refgs.errors import reason
 from refgs.events import Report
 from refgs.formats.history import FILE, damage, read
 from refgs.paths import write_text
-from refgs.train.checkpoint import DAMAGED
+from refgs.train.checkpoint import DAMAGED, set_aside
 from refgs.train.measures import Measures
 from refgs.train.state import State
 
@@ -81,8 +79,7 @@ def trim(folder: Path, iteration: int, report: Report) -> None:
     except FileNotFoundError:
         return
     except OSError as error:
-        with suppress(OSError):  # in a folder that is read-only
-            os.replace(file, file.with_name(FILE + DAMAGED))
+        set_aside(file)
         report("warning", {"what": f"{file} cannot be read and is set aside as *{DAMAGED}: {reason(error)}"})
         return
     kept = [line for line in lines if (line.get("iteration") or math.inf) <= iteration]
