@@ -15,8 +15,8 @@ from benchmarks.scenes.analytic import write_ball_capture
 from refgs.capture import read_capture
 from refgs.render.renderer import render
 from refgs.settings import load_settings
-from refgs.train.light import mean_radiance
-from refgs.train.losses import objective
+from refgs.train.learn.light import mean_radiance
+from refgs.train.learn.losses import objective
 from refgs.train.trainer import Trainer
 
 SIZE, SURFELS, REPEATS = 256, 20_000, 30

@@ -20,8 +20,8 @@ from refgs.compare import metrics
 from refgs.compare.pictures import as_bytes, composite, write_png
 from refgs.render.align import fitted
 from refgs.settings import load_settings
-from refgs.train.measures import held_out_psnr
-from refgs.train.poses import shifts
+from refgs.train.keep.measures import held_out_psnr
+from refgs.train.learn.poses import shifts
 from refgs.train.state import State, spread
 from refgs.train.trainer import Trainer
 

@@ -11,7 +11,7 @@ import pytest
 from refgs import commands, train_job
 from refgs.errors import InputError, TryAgain
 from refgs.lock import LOCK, RunLock
-from refgs.train import checkpoint
+from refgs.train.keep import checkpoint
 from tests.makers.captures import colmap
 from tests.makers.training import TINY
 

@@ -368,9 +368,9 @@ def _finish(trainer: "Trainer", out: Path, plan: Plan, report: Report) -> float 
     All comes before splats.ply, by which a run has ended. So a training that is killed here is resumed, and does it again.
     """
     from refgs.run import record_changes
-    from refgs.train.ambiguity import ambiguities
-    from refgs.train.asset import write_asset
-    from refgs.train.measures import held_out_psnr
+    from refgs.train.keep.ambiguity import ambiguities
+    from refgs.train.keep.asset import write_asset
+    from refgs.train.keep.measures import held_out_psnr
 
     state, quality = trainer.state, None
     again = command_line("refgs", "train", state.capture.folder, "--out", out, "--resume", "--device", "cpu")
@@ -429,7 +429,7 @@ def _card_memory(what: str | None = None) -> Iterator[None]:
     import torch
 
     from refgs.kernels.cuda import CardError
-    from refgs.train.densify import full_card
+    from refgs.train.learn.densify import full_card
 
     try:
         yield

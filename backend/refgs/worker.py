@@ -30,7 +30,7 @@ from refgs.kernels import cuda
 from refgs.memory import shortage_named
 from refgs.paths import disk_errors_named
 from refgs.settings import load_settings
-from refgs.train.live_view import write_preview
+from refgs.train.keep.live_view import write_preview
 from refgs.train.state import State
 
 PROTOCOL = 1

@@ -18,7 +18,7 @@ from refgs.model.adam import Adam
 from refgs.render import reference
 from refgs.render.rasterize import rasterize
 from refgs.settings import RATES
-from refgs.train.densify import faint_now
+from refgs.train.learn.densify import faint_now
 from refgs.train.start import GEOMETRY
 from refgs.train.trainer import Trainer
 

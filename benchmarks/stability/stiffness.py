@@ -22,8 +22,8 @@ from refgs.camera import Camera
 from refgs.model import cubemap, prefilter
 from refgs.render import reference
 from refgs.settings import load_settings
-from refgs.train.ambiguity import ambiguities
-from refgs.train.losses import departure
+from refgs.train.keep.ambiguity import ambiguities
+from refgs.train.learn.losses import departure
 
 STEP = 1e-4
 ROUNDING = 1e-12  # share of the largest eigenvalue below which others count as zero

@@ -16,7 +16,7 @@ from benchmarks.scenes.analytic import write_ball_capture
 from benchmarks.stability.cases import NEVER
 from refgs.capture import read_capture
 from refgs.settings import load_settings
-from refgs.train.measures import held_out_psnr
+from refgs.train.keep.measures import held_out_psnr
 from refgs.train.trainer import Trainer
 
 SIZE, TOTAL, LOOK = 32, 150, 10  # pixels; iterations; iterations between measurements of held-out views

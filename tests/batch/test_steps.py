@@ -11,7 +11,7 @@ import pytest
 
 from refgs.batch.batch import _settled
 from refgs.batch.steps import Outcome, Step, TryLater, recorded, run_step
-from refgs.train import checkpoint
+from refgs.train.keep import checkpoint
 from tests.makers.captures import nerfstudio
 from tests.makers.disk import fill
 from tests.makers.processes import commands

@@ -6,7 +6,7 @@ import torch
 
 from refgs.model.surfels import activate, initial_parameters
 from refgs.render.stack import stack
-from refgs.train.motion import ScreenGradient
+from refgs.train.screen_gradient import ScreenGradient
 from tests.makers import scenes
 
 COUNT = 5003

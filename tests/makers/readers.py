@@ -50,7 +50,7 @@ from refgs.report.page import write_report
 from refgs.run import open_run
 from refgs.run_folder import read_run_facts
 from refgs.settings import load_settings
-from refgs.train import snapshot
+from refgs.train.keep import snapshot
 from refgs.worker import Worker
 from tests.makers import captures
 from tests.makers.ball import BOX, write_run

@@ -7,7 +7,7 @@ import torch
 from refgs.capture import read_capture
 from refgs.run import create_run, open_run
 from refgs.settings import LossSettings, load_settings
-from refgs.train.asset import write_asset
+from refgs.train.keep.asset import write_asset
 from refgs.train.trainer import Trainer
 
 SMALL = [

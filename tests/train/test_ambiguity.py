@@ -10,7 +10,7 @@ import torch
 
 from benchmarks.stability.training import trainer
 from refgs.report.page import write_report
-from refgs.train.ambiguity import TRADES, _pictures, ambiguities
+from refgs.train.keep.ambiguity import TRADES, _pictures, ambiguities
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from refgs.errors import InputError
-from refgs.train import checkpoint
+from refgs.train.keep import checkpoint
 from tests.makers.mutants import put_link
 
 

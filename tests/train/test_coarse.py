@@ -6,8 +6,8 @@ import torch
 
 from refgs import train_job
 from refgs.capture import cached
-from refgs.train import coarse
-from refgs.train.object_size import object_size
+from refgs.train.decide.object_size import object_size
+from refgs.train.learn import coarse
 from refgs.train.plan import FULL, Stage
 from tests.makers.training import check_equal, trainer
 

@@ -5,8 +5,8 @@ from refgs.camera import Camera
 from refgs.model.adam import Adam
 from refgs.model.surfels import activate, initial_parameters
 from refgs.settings import load_settings
-from refgs.train.densify import densify
-from refgs.train.motion import ScreenGradient
+from refgs.train.learn.densify import densify
+from refgs.train.screen_gradient import ScreenGradient
 
 SETTINGS = load_settings("quick").densify
 

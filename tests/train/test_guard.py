@@ -17,9 +17,9 @@ from refgs.render.directional import directional
 from refgs.render.rasterize import rasterize
 from refgs.render.shade import shade
 from refgs.settings import load_settings
-from refgs.train.densify import faint
-from refgs.train.guard import MOST_IN_A_ROW, Guard, limits, remove_broken, running
-from refgs.train.motion import ScreenGradient
+from refgs.train.learn.densify import faint
+from refgs.train.learn.guard import MOST_IN_A_ROW, Guard, limits, remove_broken, running
+from refgs.train.screen_gradient import ScreenGradient
 from tests.makers import scenes
 
 

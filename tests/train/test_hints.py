@@ -12,11 +12,13 @@ from refgs.errors import InputError
 from refgs.formats.hints import FILE, KINDS, Hint, read_hints, write_hints
 from refgs.formats.splats import read_splats
 from refgs.run_folder import read_run_facts
-from refgs.train import checkpoint, metals, needs
-from refgs.train.asset import write_asset
-from refgs.train.densify import densify
+from refgs.train.decide import needs
 from refgs.train.hints import AGAIN, AT_MOST, continue_with_hints, hinted_kinds
-from refgs.train.measures import held_out_psnr
+from refgs.train.keep import checkpoint
+from refgs.train.keep.asset import write_asset
+from refgs.train.keep.measures import held_out_psnr
+from refgs.train.learn.densify import densify
+from refgs.train.material import metals
 from tests.makers.training import TINY, put, trained, trainer
 
 TOTAL = 400

@@ -11,7 +11,7 @@ from benchmarks.scenes.analytic import F0, ONE, sky
 from refgs.capture import read_capture
 from refgs.formats.exr import read_exr, write_exr
 from refgs.formats.panorama import directions
-from refgs.train import history
+from refgs.train.keep import history
 from tests.makers import scenes
 from tests.makers.ball import dusk
 from tests.makers.mutants import put_link

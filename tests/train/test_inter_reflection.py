@@ -8,8 +8,8 @@ from benchmarks.scenes.analytic import TWO, meet, write_ball_capture
 from refgs.capture import read_capture
 from refgs.compare.pictures import composite
 from refgs.run import open_run
-from refgs.train.asset import write_asset
-from refgs.train.measures import held_out_psnr
+from refgs.train.keep.asset import write_asset
+from refgs.train.keep.measures import held_out_psnr
 from tests.makers import scenes
 from tests.makers.training import trainer
 

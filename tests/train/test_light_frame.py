@@ -13,7 +13,7 @@ from refgs.capture.poses import OPENGL_TO_OPENCV
 from refgs.formats.panorama import directions
 from refgs.model.environment import turn_between
 from refgs.run import open_run
-from refgs.train.measures import held_out_psnr
+from refgs.train.keep.measures import held_out_psnr
 from tests.makers.training import asset_error, trained, trainer
 
 METAL = "surfels.metallic=0.9"

@@ -14,8 +14,9 @@ from refgs.color import srgb_decode
 from refgs.formats.exr import write_exr
 from refgs.formats.panorama import directions
 from refgs.render.renderer import Rendering
-from refgs.train.losses import Photo, objective
-from refgs.train.measures import held_out_psnr
+from refgs.train.keep.measures import held_out_psnr
+from refgs.train.learn.losses import objective
+from refgs.train.photo import Photo
 from tests.makers.captures import write
 from tests.makers.training import only, trained
 

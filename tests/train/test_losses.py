@@ -12,7 +12,8 @@ from refgs.render import reference as oracle
 from refgs.render.reference import unit
 from refgs.render.renderer import COVERED, Rendering
 from refgs.settings import LossSettings
-from refgs.train.losses import Photo, objective
+from refgs.train.learn.losses import objective
+from refgs.train.photo import Photo
 from tests.makers import scenes
 from tests.makers.emulate import emulate
 from tests.makers.training import only

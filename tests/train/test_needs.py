@@ -18,13 +18,14 @@ from benchmarks.scenes.analytic import write_ball_capture
 from refgs.formats.splats import read_splats
 from refgs.model.environment import Environment
 from refgs.run import open_run
-from refgs.train import needs, probe
-from refgs.train.asset import write_asset
-from refgs.train.densify import RESET, SEEN, faint_now
-from refgs.train.losses import Photo, objective
-from refgs.train.measures import held_out_psnr
-from refgs.train.needs import lighting, photos, schedule
-from refgs.train.needs.materials import CHANGES
+from refgs.train import probe
+from refgs.train.decide import iterations, lighting, needs, photos
+from refgs.train.decide.materials import CHANGES
+from refgs.train.keep.asset import write_asset
+from refgs.train.keep.measures import held_out_psnr
+from refgs.train.learn.densify import RESET, SEEN, faint_now
+from refgs.train.learn.losses import objective
+from refgs.train.photo import Photo
 from refgs.train.plan import Plan
 from refgs.train.state import why_not_traced
 from tests.makers.occluders import as_occluder, plate
@@ -76,9 +77,11 @@ def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
     found = chalk.state.needs["iterations"]
     assert not found["needed"] and found["seconds"] > 0
     assert found["statistic"] == chalk.state.needs["specular"]["statistic"]
-    assert chalk.state.iteration == chalk.state.total == found["total"] == 100 + round(schedule.Iterations.ENOUGH * 200)
+    assert (
+        chalk.state.iteration == chalk.state.total == found["total"] == 100 + round(iterations.Iterations.ENOUGH * 200)
+    )
     forced = trainer(matte, tmp_path / "off", "needs.specular=off", total=150)
-    assert forced.state.total == forced.state.needs["iterations"]["total"] == round(schedule.Iterations.ENOUGH * 150)
+    assert forced.state.total == forced.state.needs["iterations"]["total"] == round(iterations.Iterations.ENOUGH * 150)
     assert trainer(matte, tmp_path / "on", "needs.specular=off", "needs.iterations=on", total=150).state.total == 150
     forced.state.needs.clear()
     forced.state.plan = Plan(1.0)

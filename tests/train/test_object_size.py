@@ -5,7 +5,7 @@ import math
 import pytest
 
 from refgs.settings import load_settings
-from refgs.train.object_size import object_size, surfel_budget
+from refgs.train.decide.object_size import object_size, surfel_budget
 from tests.makers.training import trainer
 
 MANY = ["surfels.start=100", "surfels.budget=100000"]

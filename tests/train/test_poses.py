@@ -11,7 +11,7 @@ from refgs.capture import read_capture
 from refgs.capture.matches import Matches
 from refgs.run import open_run
 from refgs.settings import load_settings
-from refgs.train import poses
+from refgs.train.learn import poses
 from tests.makers.training import check_equal, trained, trainer
 
 ON = "cameras.poses=on"

@@ -10,8 +10,8 @@ import torch
 
 from refgs.capture import read_capture
 from refgs.render.rendering import Rendering
-from refgs.train import priors
-from refgs.train.losses import Photo
+from refgs.train.learn import priors
+from refgs.train.photo import Photo
 from tests.makers import scenes
 from tests.makers.bowl import bowl_normals, write_bowl_capture
 from tests.makers.priors import OPENGL, true_maps, write_depth, write_normals

@@ -14,7 +14,7 @@ from refgs.errors import InputError
 from refgs.formats.gltf import read_glb
 from refgs.formats.splats import read_splats
 from refgs.run import open_run
-from refgs.train.live_view import write_preview
+from refgs.train.keep.live_view import write_preview
 from refgs.train.start import AROUND, start_parameters
 from tests.makers.training import SMALL, trainer
 

@@ -11,7 +11,7 @@ from refgs.model import harmonics
 from refgs.render.rasterize import rasterize
 from refgs.render.volume import discs
 from refgs.run import open_run
-from refgs.train.asset import write_asset
+from refgs.train.keep.asset import write_asset
 from tests.makers.training import asset_error, trained, trainer
 
 CHANGES = ["train.light_first=0", "residual.start=0.5", "rates.residual=0.02"]

@@ -9,9 +9,9 @@ import torch
 
 from refgs.formats.splats import read_splats
 from refgs.model.surfels import activate, raw_metallic
-from refgs.train import metals, mirrored, same_material
-from refgs.train.asset import write_asset
-from refgs.train.mirrored import Fit, Seen
+from refgs.train.keep.asset import write_asset
+from refgs.train.material import metals, mirrored, same_material
+from refgs.train.material.mirrored import Fit, Seen
 from tests.makers.lamps import show
 from tests.makers.training import put
 from tests.makers.training import trainer as small

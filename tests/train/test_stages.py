@@ -12,9 +12,9 @@ from refgs.model import cubemap
 from refgs.model.environment import Environment
 from refgs.model.surfels import activate, initial_parameters
 from refgs.settings import load_settings
-from refgs.train.light import diffuse, mirrored
-from refgs.train.measures import held_out_psnr
-from refgs.train.rates import set_rates
+from refgs.train.keep.measures import held_out_psnr
+from refgs.train.learn.light import diffuse, mirrored
+from refgs.train.learn.rates import set_rates
 from refgs.train.setup import start_deferred
 from refgs.train.start import GEOMETRY
 from tests.makers.training import asset_error, learned, trained, trainer

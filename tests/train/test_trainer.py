@@ -19,8 +19,8 @@ from refgs.formats.panorama import directions
 from refgs.model import harmonics
 from refgs.model.surfels import to_splats
 from refgs.run import open_run
-from refgs.train.asset import write_asset
-from refgs.train.measures import held_out_psnr
+from refgs.train.keep.asset import write_asset
+from refgs.train.keep.measures import held_out_psnr
 from tests.makers import scenes
 from tests.makers.captures import edit
 from tests.makers.training import SMALL, asset_error, check_equal, put, trained, trainer

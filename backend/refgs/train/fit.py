@@ -6,9 +6,9 @@ from pathlib import Path
 from refgs.capture import Capture
 from refgs.events import Report
 from refgs.settings import RATES, Settings, load_settings, validate
-from refgs.train import coarse
+from refgs.train.decide.object_size import object_size, surfel_budget
 from refgs.train.effective import Effective
-from refgs.train.object_size import object_size, surfel_budget
+from refgs.train.learn import coarse
 from refgs.train.plan import BY_PIXELS, END, END_A_VIEW, FULL, OTHERS, Plan, growth, iterations_time
 from refgs.train.trainer import Trainer
 

@@ -14,7 +14,9 @@ from refgs.errors import InputError
 from refgs.formats.hints import KINDS, Hint
 from refgs.formats.splats import read_splats
 from refgs.settings import Settings
-from refgs.train import metals, needs, snapshot
+from refgs.train.decide import needs
+from refgs.train.keep import snapshot
+from refgs.train.material import metals
 from refgs.train.start import start_appearance
 from refgs.train.state import State
 

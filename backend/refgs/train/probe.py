@@ -1,6 +1,6 @@
 """Measure how much worse pictures get, and how much faster an iteration gets, if a part of the training is left out.
 
-`refgs.train.needs` uses these measurements for its decisions. They are made on training views, with the surfels and the light as they are
+`decide.needs` uses these measurements for its decisions. They are made on training views, with the surfels and the light as they are
 now, and only on pixels that show the object. PSNR is computed from the mean squared error over these pixels of all measured views.
 """
 
@@ -18,7 +18,8 @@ from refgs.model.surfels import Surfels
 from refgs.render.rasterize import rasterize
 from refgs.render.rendering import COVERED, Rendering
 from refgs.render.volume import discs
-from refgs.train.losses import Photo, objective
+from refgs.train.learn.losses import objective
+from refgs.train.photo import Photo
 from refgs.train.state import RenderInputs, State, spread
 
 VIEWS = 8  # that are looked at, at the most

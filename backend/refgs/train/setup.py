@@ -11,12 +11,13 @@ from refgs.capture import Capture
 from refgs.events import Report
 from refgs.model.adam import Adam
 from refgs.model.surfels import Parameters, activate
-from refgs.train import coarse, light, needs, poses, priors
+from refgs.train.decide import needs
+from refgs.train.decide.light_frame import light_frame
+from refgs.train.decide.object_size import limit_surfels, object_size
 from refgs.train.effective import Effective
-from refgs.train.guard import limits
-from refgs.train.light_frame import light_frame
-from refgs.train.losses import Photo
-from refgs.train.object_size import limit_surfels, object_size
+from refgs.train.learn import coarse, light, poses, priors
+from refgs.train.learn.guard import limits
+from refgs.train.photo import Photo
 from refgs.train.plan import Plan
 from refgs.train.start import start_appearance, start_parameters
 from refgs.train.state import EXPOSURE, State, why_not_traced

@@ -21,9 +21,9 @@ from refgs.render.renderer import Rendering, near_plane, render
 from refgs.run_folder import PHOTOS
 from refgs.settings import LossSettings, RenderSettings, Settings
 from refgs.train.effective import Effective
-from refgs.train.losses import Photo
-from refgs.train.motion import ScreenGradient
+from refgs.train.photo import Photo
 from refgs.train.plan import FULL, Plan, Stage, iterations_time
+from refgs.train.screen_gradient import ScreenGradient
 
 # Changes of a photo's response, as logarithms of factors of red, green and blue: brightness, then temperature and tint, which are its white
 # balance. The latter two are scaled down so that they learn more slowly: photos differ less in them.

@@ -12,28 +12,18 @@ from refgs.compare.metrics import decibels
 from refgs.events import Report
 from refgs.memory import trim
 from refgs.settings import Settings
-from refgs.train import (
-    checkpoint,
-    coarse,
-    densify,
-    even_metal,
-    exposures,
-    history,
-    light,
-    metals,
-    needs,
-    poses,
-    priors,
-    snapshot,
-)
+from refgs.train.decide import needs
 from refgs.train.effective import Effective
-from refgs.train.guard import Guard, running, warn
-from refgs.train.losses import departure, objective
-from refgs.train.measures import Measures
+from refgs.train.keep import checkpoint, history, snapshot
+from refgs.train.keep.measures import Measures
+from refgs.train.learn import coarse, densify, exposures, light, poses, priors
+from refgs.train.learn.guard import Guard, running, warn
+from refgs.train.learn.losses import departure, objective
+from refgs.train.learn.rates import set_rates
+from refgs.train.learn.trace import trace_due
+from refgs.train.material import even_metal, metals
 from refgs.train.plan import Plan, growth
-from refgs.train.rates import set_rates
 from refgs.train.setup import set_up, start_deferred
-from refgs.train.trace import trace_due
 
 REPORT_EVERY = 10  # iterations
 

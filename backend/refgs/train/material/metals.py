@@ -10,11 +10,12 @@ again, since roughness, light and base colour explain rough metal and paint abou
 import torch
 
 from refgs.model.surfels import raw_metallic
-from refgs.train import mirrored, needs, same_material
-from refgs.train.changing_light import explained
-from refgs.train.needs.materials import SOONEST
+from refgs.train.decide import needs
+from refgs.train.decide.materials import SOONEST
+from refgs.train.material import mirrored, same_material
+from refgs.train.material.changes import falls_as_metal, observe, shines_as_metal
+from refgs.train.material.changing_light import explained
 from refgs.train.state import State
-from refgs.train.view_dependence import falls_as_metal, observe, shines_as_metal
 
 KNOWN = 0.1  # part of the training after which surfels lie near enough to the surface
 METAL, PAINT = 0.9, 0.02  # metallic; training can still change it

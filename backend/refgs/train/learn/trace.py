@@ -11,8 +11,8 @@ from refgs.model.surfels import Surfels
 from refgs.render.extract import extract
 from refgs.render.relight import received
 from refgs.render.volume import with_normals_last
-from refgs.train import needs
-from refgs.train.densify import faint_now
+from refgs.train.decide import needs
+from refgs.train.learn.densify import faint_now
 from refgs.train.state import State, why_not_traced
 
 VIEWS = 24  # at least, that the mesh is fused from; all where there are fewer

@@ -6,9 +6,10 @@ from typing import Any
 import torch
 
 from refgs.model.prefilter import IRRADIANCE_SIDE
-from refgs.train import light, probe
-from refgs.train.needs.materials import INDIRECT
-from refgs.train.needs.need import ASKED, MEGA, NUMBER, Decision, Moment, Need, megabytes
+from refgs.train import probe
+from refgs.train.decide.materials import INDIRECT
+from refgs.train.decide.need import ASKED, MEGA, NUMBER, Decision, Moment, Need, megabytes
+from refgs.train.learn import light
 from refgs.train.state import RenderInputs, State
 
 VISIBLE = 0.1  # dB of a small part of the object (`probe.PART`), where the rest hides it in the mean

@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 
 from refgs.model.surfels import Surfels
-from refgs.train import probe, view_dependence
-from refgs.train.guard import limits
-from refgs.train.needs.need import ASKED, MEGA, Decision, Moment, Need, megabytes
+from refgs.train import probe
+from refgs.train.decide.need import ASKED, MEGA, Decision, Moment, Need, megabytes
+from refgs.train.learn.guard import limits
+from refgs.train.material import changes
 from refgs.train.start import start_appearance
 from refgs.train.state import RenderInputs, State, why_not_traced
 
@@ -50,7 +51,7 @@ class Specular(Need):
         if explained.part >= SMALL_PART:
             return Decision(True, why, statistic=explained.part, threshold=SMALL_PART)
         # Normals are not right yet, and an embossed metal has no sharp reflections: it explains nothing, and yet it shines.
-        change = view_dependence.change_seen(view_dependence.observe(state), state.wanted())
+        change = changes.change_seen(changes.observe(state), state.wanted())
         why += f"; colours change with the view by {change:.3f} of 1"
         if change >= CHANGES:
             return Decision(True, why, statistic=change, threshold=CHANGES)
@@ -77,7 +78,7 @@ class Specular(Need):
         found = state.needs.get(self.name, {"needed": True})
         if found["needed"] or "statistic" not in found or "again" in found or 2 * state.iteration < state.total:
             return None
-        change = found["again"] = view_dependence.change_seen(view_dependence.observe(state), state.wanted())
+        change = found["again"] = changes.change_seen(changes.observe(state), state.wanted())
         why = f"halfway, colours change with the view by {change:.3f} of 1: it was taken for matte before"
         return Decision(True, why, statistic=change, threshold=CHANGES) if change >= CHANGES else None
 

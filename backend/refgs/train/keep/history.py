@@ -8,8 +8,8 @@ from refgs.errors import reason
 from refgs.events import Report
 from refgs.formats.history import FILE, damage, read
 from refgs.paths import write_text
-from refgs.train.checkpoint import DAMAGED, set_aside
-from refgs.train.measures import Measures
+from refgs.train.keep.checkpoint import DAMAGED, set_aside
+from refgs.train.keep.measures import Measures
 from refgs.train.state import State
 
 FIRST = 10  # iterations before the first line

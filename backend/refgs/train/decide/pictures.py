@@ -1,6 +1,6 @@
 """Write pictures of a training view rendered with an optional part of the training and without it, when it is decided.
 
-They show the artist what a decision of `refgs.train.needs` is about. They are written to the run folder, in `needs/`.
+They show the artist what a decision of `refgs.train.decide.needs` is about. They are written to the run folder, in `needs/`.
 """
 
 import math

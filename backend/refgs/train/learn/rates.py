@@ -1,6 +1,6 @@
 """Set the learning rates of an iteration: decay them, and freeze some parameters in some stages of the training."""
 
-from refgs.train.densify import since_propagation
+from refgs.train.learn.densify import since_propagation
 from refgs.train.start import GEOMETRY
 from refgs.train.state import State
 

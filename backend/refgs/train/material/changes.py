@@ -16,7 +16,7 @@ from refgs.model import harmonics
 from refgs.model.environment import turn_between
 from refgs.model.surfels import Surfels
 from refgs.train import probe
-from refgs.train.losses import Photo
+from refgs.train.photo import Photo
 from refgs.train.state import State
 
 VIEWS = 24  # photos that are looked at, at the most

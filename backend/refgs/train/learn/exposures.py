@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from refgs.train.densify import faint_now
+from refgs.train.learn.densify import faint_now
 from refgs.train.state import State
 
 KNOWN = 0.3  # part of the training after which exposures are known well enough to judge

@@ -7,10 +7,10 @@ import numpy as np
 from refgs.capture import LoadedView
 from refgs.compare.metrics import psnr
 from refgs.train import probe
-from refgs.train.needs.need import MEGA, Decision, Moment, Need
+from refgs.train.decide.need import MEGA, Decision, Moment, Need
+from refgs.train.photo import MARGIN, bounds
 from refgs.train.state import State
 
-MARGIN = 10  # pixels about the mask: no D-SSIM window, whose radius is 5, then sees both the object and the border
 WHOLE_EVERY = 8  # iterations: one of these sees its whole photo, so that nothing stays beyond the margin
 TIMED = 100  # iterations after which the time that crops save is measured
 ALIKE_PIXELS, ALIKE_DECIBELS = 0.5, 40.0  # duplicates move by less, and differ by no more than 8-bit photos' noise
@@ -68,18 +68,6 @@ def time_crops(state: State) -> None:
     """
     if state.crops is not None and state.iteration >= TIMED and "seconds" not in state.needs["outside"]:
         state.needs["outside"]["seconds"] = (1 - 1 / WHOLE_EVERY) * probe.seconds_saved(state, whole=True)
-
-
-def bounds(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """Return the smallest ranges of rows and columns that contain a mask (H, W), enlarged by `margin` pixels on each side.
-
-    If the mask is empty, return all rows and columns.
-    """
-    shown = []
-    for axis, size in ((1, mask.shape[0]), (0, mask.shape[1])):
-        there = np.flatnonzero(mask.any(axis=axis)) if mask.any() else np.array([0, size - 1])
-        shown.append(slice(max(int(there[0]) - margin, 0), min(int(there[-1]) + 1 + margin, size)))
-    return tuple(shown)
 
 
 def duplicate_views(views: list[LoadedView], radius: float) -> list[int]:

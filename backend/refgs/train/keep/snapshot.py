@@ -10,7 +10,9 @@ from refgs.formats.checkpoint import Facts
 from refgs.formats.mesh import Mesh
 from refgs.formats.validate import validated
 from refgs.geometry.visibility import Occluder
-from refgs.train import checkpoint, coarse, needs, poses
+from refgs.train.decide import needs
+from refgs.train.keep import checkpoint
+from refgs.train.learn import coarse, poses
 from refgs.train.state import State, why_not_traced
 
 

@@ -9,13 +9,13 @@ import json
 from typing import Any
 
 from refgs.paths import write_text
-from refgs.train.densify import faint_now
-from refgs.train.needs.lighting import Degrees, Light, Reflections, share_hidden
-from refgs.train.needs.materials import Constants, Specular
-from refgs.train.needs.need import Decision, Moment, Need
-from refgs.train.needs.photos import WHOLE_EVERY, Outside, Views, time_crops
-from refgs.train.needs.pictures import write_pictures
-from refgs.train.needs.schedule import Initial, Iterations
+from refgs.train.decide.iterations import Initial, Iterations
+from refgs.train.decide.lighting import Degrees, Light, Reflections, share_hidden
+from refgs.train.decide.materials import Constants, Specular
+from refgs.train.decide.need import Decision, Moment, Need
+from refgs.train.decide.photos import WHOLE_EVERY, Outside, Views, time_crops
+from refgs.train.decide.pictures import write_pictures
+from refgs.train.learn.densify import faint_now
 from refgs.train.state import State
 
 CONSTANTS, SPECULAR = Constants(), Specular()

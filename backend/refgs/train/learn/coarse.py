@@ -5,9 +5,8 @@ Small objects are trained on full photos from the start: of an object of 64 pixe
 
 from refgs.capture import LoadedView, reduced_views
 from refgs.run_folder import PHOTOS
-from refgs.train import poses
-from refgs.train.losses import Photo
-from refgs.train.needs.photos import MARGIN, bounds
+from refgs.train.learn import poses
+from refgs.train.photo import MARGIN, Photo, bounds
 from refgs.train.plan import FULL, Stage
 from refgs.train.state import Reduced, State
 

@@ -35,7 +35,7 @@ class Decision(NamedTuple):
 class Need:
     """Describe an optional part of the training, such as inter-reflection, and how to decide whether a scene needs it.
 
-    `refgs.train.needs` lists all of them.
+    `refgs.train.decide.needs` lists all of them.
     """
 
     name: ClassVar[str]  # also in the settings' `needs`

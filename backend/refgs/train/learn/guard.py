@@ -8,8 +8,8 @@ from torch import Tensor
 from refgs.errors import InputError
 from refgs.model.adam import Adam
 from refgs.model.surfels import Parameters
-from refgs.train import checkpoint
-from refgs.train.densify import take
+from refgs.train.keep import checkpoint
+from refgs.train.learn.densify import take
 from refgs.train.state import State
 
 MOST_IN_A_ROW = 30  # steps that may be left out before the training goes back

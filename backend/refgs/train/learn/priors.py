@@ -19,7 +19,7 @@ from refgs.camera import Camera
 from refgs.capture import load_depth, load_normals
 from refgs.capture.poses import split_similarity
 from refgs.render.rendering import Rendering
-from refgs.train.losses import Photo
+from refgs.train.photo import Photo
 from refgs.train.state import Priors, State, spread
 
 FADED = 0.6  # part of the training after which priors have no weight

@@ -5,7 +5,7 @@ The first stage shades each surfel, before blending. The second stage shades eac
 
 from typing import Any
 
-from refgs.train.needs.need import ASKED, Decision, Moment, Need
+from refgs.train.decide.need import ASKED, Decision, Moment, Need
 from refgs.train.state import State
 
 

@@ -17,7 +17,7 @@ from refgs.capture import Capture
 from refgs.capture.matches import match_neighbours, pixels_apart
 from refgs.render.align import REDUCTIONS, pose_step, posed
 from refgs.render.rendering import Rendering
-from refgs.train.losses import Photo
+from refgs.train.photo import Photo
 from refgs.train.state import State
 
 FROM, KNOWN, UNTIL = 0.05, 0.3, 2 / 3  # parts of the training: poses start to learn, are judged, and are frozen

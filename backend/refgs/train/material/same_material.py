@@ -13,8 +13,8 @@ from scipy.sparse.linalg import cg
 from torch import Tensor
 
 from refgs.model.surfels import Surfels
-from refgs.train.mirrored import Fit, Seen
-from refgs.train.view_dependence import neighbours
+from refgs.train.material.changes import neighbours
+from refgs.train.material.mirrored import Fit, Seen
 
 # Of a surfel's error as a metal, in parts of its error as paint: it is a metal below METAL, if what it mirrors shows by SLOPE and if it
 # reflects REFLECTANCE, and paint above PAINT. Painted plastic reaches a reflectance of 0.3, most metals have more than 0.4.
@@ -52,7 +52,7 @@ class Found(NamedTuple):
 
 
 def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
-    """Decide which surfels are taken for the wrong kind, from what photos tell (see `refgs.train.mirrored`) and from their neighbours.
+    """Decide which surfels are taken for the wrong kind, from what photos tell (see `material.mirrored`) and from their neighbours.
 
     Evidence for either kind spreads over a surface. The kind that training has found so far stays where there is none. It does not spread.
     """

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from refgs.settings import SurfelSettings
-from refgs.train.needs.photos import bounds
+from refgs.train.photo import bounds
 from refgs.train.state import State, spread
 
 VIEWS = 24  # that are looked at, at the most

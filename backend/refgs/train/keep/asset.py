@@ -21,7 +21,9 @@ from refgs.render.facing import facing_cosine
 from refgs.render.volume import with_normals_last
 from refgs.run import OCCLUDER
 from refgs.run_folder import SPLATS, update_metrics
-from refgs.train import metals, needs, poses
+from refgs.train.decide import needs
+from refgs.train.learn import poses
+from refgs.train.material import metals
 from refgs.train.probe import blended_shares
 from refgs.train.state import State, why_not_traced
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from refgs.model.surfels import activate
-from refgs.train import even_metal, metals, view_dependence
-from refgs.train.changing_light import CHANGED, LEFT, explained
-from refgs.train.densify import densify
-from refgs.train.needs.materials import CHANGES
+from refgs.train.decide.materials import CHANGES
+from refgs.train.learn.densify import densify
+from refgs.train.material import changes, even_metal, metals
+from refgs.train.material.changing_light import CHANGED, LEFT, explained
 from tests.makers.lamps import LAMPS, ORANGE, show
 from tests.makers.training import put
 from tests.makers.training import trainer as small
@@ -26,10 +26,10 @@ def made(large_ball, tmp_path):
 def told(made):
     """Return which part of the usable surface shines as metal, and how much the surface changes with the view."""
     state = made.state
-    found = view_dependence.observe(state)
+    found = changes.observe(state)
     usable = found.usable.any(dim=1)
-    metal = view_dependence.shines_as_metal(found, state.parameters["position"].detach()).clearly
-    change = view_dependence.change_seen(found, state.wanted())
+    metal = changes.shines_as_metal(found, state.parameters["position"].detach()).clearly
+    change = changes.change_seen(found, state.wanted())
     return float(metal[usable].float().mean()), change
 
 
@@ -66,9 +66,9 @@ def test_a_grey_surface_tells_nothing(made):
 def falls(made):
     """Return which part of the usable surface falls as far below its median as only metals do."""
     state = made.state
-    found = view_dependence.observe(state)
+    found = changes.observe(state)
     light = float(state.environment().radiance.detach().mean())
-    metal = view_dependence.falls_as_metal(found, state.parameters["position"].detach(), light)
+    metal = changes.falls_as_metal(found, state.parameters["position"].detach(), light)
     return float(metal[found.usable.any(dim=1)].float().mean())
 
 
@@ -86,18 +86,18 @@ def test_a_small_part_that_shines_counts(made):
     """Check that a patch of chrome, 4 % of a matte surface, changes the surface's figure by more than the threshold."""
     state = made.state
     show(made, metallic=6.0, roughness=-4.0, albedo=[3.0, 3.0, 3.0])
-    found = view_dependence.observe(state)
+    found = changes.observe(state)
     still = found._replace(change=0.02 * torch.randn(found.change.shape, generator=torch.Generator().manual_seed(2)))
-    assert view_dependence.change_seen(still, state.wanted()) < CHANGES
+    assert changes.change_seen(still, state.wanted()) < CHANGES
     usable = found.usable.any(dim=1).nonzero()[:, 0]
     patch = usable[::25]
     still.change[patch] = found.change[patch]
-    assert view_dependence.change_seen(still, state.wanted()) > CHANGES
+    assert changes.change_seen(still, state.wanted()) > CHANGES
 
 
 def explanation(made):
     """Explain the changes of all surfels."""
-    found, positions = view_dependence.observe(made.state), made.state.parameters["position"].detach()
+    found, positions = changes.observe(made.state), made.state.parameters["position"].detach()
     (whole,) = explained(found, positions, made.state.capture.radius, torch.ones(len(positions), dtype=torch.bool))
     return whole
 

@@ -6,8 +6,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from refgs.camera import Camera
-from refgs.capture import LoadedView
 from refgs.clock import timed
 from refgs.kernels import cuda, load
 from refgs.kernels.layout import struct
@@ -15,55 +13,11 @@ from refgs.kernels.load import check, run
 from refgs.render.renderer import Rendering
 from refgs.render.ssim import dssim
 from refgs.settings import LossSettings
+from refgs.train.photo import Photo
 
 TILE = 32, 8  # pixels of a row, and rows, that a block of losses.cpp has on CUDA
 ROUND_OFF = 0.02
 SUMS = 3  # of a row or a block: of the loss, of the pixels with a surface, of squared errors
-
-
-class Photo(NamedTuple):
-    """Hold a view's photo on the training's device: `image` (H, W, 3), sRGB codes, and `mask` (H, W) uint8 or None.
-
-    `image` has the dtype uint8 or uint16, and `white` is the code of 1. The dtype's largest code means that or brighter.
-
-    The photo may be a crop of a photo of the size `whole` (H, W). Beyond the crop, the whole photo is background.
-    """
-
-    image: Tensor
-    mask: Tensor | None
-    camera: Camera
-    whole: tuple[int, int] | None = None
-    white: int = 255
-
-    @classmethod
-    def of(cls, view: LoadedView, device: torch.device | str = "cpu") -> "Photo":
-        mask = None if view.alpha is None else torch.from_numpy(view.alpha).to(device)
-        return cls(torch.from_numpy(view.image).to(device), mask, view.camera, white=view.white)
-
-    def part(self, rows: slice, columns: slice) -> "Photo":
-        """Return this photo cropped to ranges of rows and columns."""
-        image = self.image[rows, columns].contiguous()
-        mask = None if self.mask is None else self.mask[rows, columns].contiguous()
-        camera = self.camera.cropped(columns.start, rows.start, image.shape[1], image.shape[0])
-        return Photo(image, mask, camera, self.whole or self.image.shape[:2], self.white)
-
-    @property
-    def encoded(self) -> Tensor:
-        """Return the sRGB-encoded photo as float32 (H, W, 3): 1 is white, and an EXR may be brighter."""
-        return self.image.float() / self.white
-
-    def over(self, background: Tensor) -> Tensor:
-        """Composite the photo over a background colour (3,). Returns sRGB-encoded floats (H, W, 3), clipped to white."""
-        image = self.encoded.clamp_max(1)
-        if self.mask is None:
-            return image
-        opaque = self.mask.float()[..., None] / 255
-        return image * opaque + background * (1 - opaque)
-
-    @property
-    def clipped(self) -> Tensor:
-        """Return where each channel (H, W, 3) is clipped, or nearly so: JPEG does not keep the largest code exactly."""
-        return self.image.float() >= torch.iinfo(self.image.dtype).max // 255 * 254
 
 
 class Objective(NamedTuple):

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from refgs.model.surfels import Surfels
+from refgs.train.material.changes import SATURATED, from_grey, neighbours, pooled
 from refgs.train.state import State
-from refgs.train.view_dependence import SATURATED, from_grey, neighbours, pooled
 
 EVERY = 50  # iterations
 UNTIL = 0.6  # part of the training

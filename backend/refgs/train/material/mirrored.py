@@ -18,8 +18,8 @@ from refgs.model.surfels import Surfels
 from refgs.render import reference
 from refgs.render.relight import blend, mirror
 from refgs.train import probe
+from refgs.train.material.changes import LEAST_CLIPPED, LEAST_PIXELS, NEIGHBOURS, VIEWS, linear, neighbours, pooled
 from refgs.train.state import RenderInputs, State
-from refgs.train.view_dependence import LEAST_CLIPPED, LEAST_PIXELS, NEIGHBOURS, VIEWS, linear, neighbours, pooled
 
 ROUGHNESSES = 0.05, 0.2, 0.45  # that are tried
 GRAZING = 0.15  # least cosine between normal and camera: nearer to grazing, normals are not good enough

@@ -1,0 +1,1 @@
+"""Decide, for each scene, what a training needs, and what it can do without."""

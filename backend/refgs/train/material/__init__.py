@@ -1,0 +1,1 @@
+"""Tell metal from paint by what the photos show of each surfel."""
