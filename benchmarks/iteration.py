@@ -67,7 +67,7 @@ def _time_parts(trainer: Trainer, rows: dict[str, list[float]]) -> None:
     at = record("losses", at)
     loss.backward()
     record("backward of all", at)
-    trainer.state.forget_gradients()
+    trainer.state.learned.forget_gradients()
     at = clock()
     trainer.step()
     record("a whole iteration", at)

@@ -13,7 +13,7 @@ from refgs.camera import Camera
 from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.model import cubemap
-from refgs.model.adam import Adam
+from refgs.model.learned import Learned
 from refgs.model.prefilter import prefilter
 from refgs.model.surfels import activate
 from refgs.render import reference
@@ -157,8 +157,10 @@ def steps(size: float) -> Outcome:
     generator = torch.Generator().manual_seed(0)
     start = torch.randn(1000, generator=generator)
     gradients = size * torch.randn(100, 1000, generator=generator)
-    value, exact = start.clone().requires_grad_(), start.double().requires_grad_()
-    ours, torchs = Adam([{"params": [value], "lr": 1e-2}]), torch.optim.Adam([exact], lr=1e-2, eps=Adam.EPSILON)
+    ours, exact = Learned(), start.double().requires_grad_()
+    ours.learn("value", start.clone())
+    value, ours.rates["value"] = ours["value"], 1e-2
+    torchs = torch.optim.Adam([exact], lr=1e-2, eps=Learned.EPSILON)
     for gradient in gradients:
         value.grad, exact.grad = gradient, gradient.double()
         ours.step(), torchs.step()

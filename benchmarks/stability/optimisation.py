@@ -14,12 +14,12 @@ from benchmarks.stability.geometry import camera, surfels
 from benchmarks.stability.photos import NOISE
 from benchmarks.stability.training import TOTAL, ball, train, trainer, usual
 from refgs.errors import InputError
-from refgs.model.adam import Adam
+from refgs.model.learned import Learned
 from refgs.render import reference
 from refgs.render.rasterize import rasterize
 from refgs.settings import RATES
-from refgs.train.learn.densify import faint_now
 from refgs.train.start import GEOMETRY
+from refgs.train.timeline import faint_now
 from refgs.train.trainer import Trainer
 
 AT, UNTIL, LONG = 50, 90, 300  # iterations: start and end of a disturbance, length of a long training
@@ -76,11 +76,11 @@ def nan_gradient(name: str, every: bool = False) -> Callable[[Trainer], None]:
     def change(made: Trainer) -> None:
         judge = made.guard.judge
 
-        def judged(loss: Tensor, optimizer) -> Tensor:
+        def judged(loss: Tensor, learned: Learned) -> Tensor:
             if not every:
                 made.guard.judge = judge
-            made.state.parameters[name].grad.view(-1)[7] = math.nan
-            return judge(loss, optimizer)
+            made.state.learned[name].grad.view(-1)[7] = math.nan
+            return judge(loss, learned)
 
         made.guard.judge = judged
 
@@ -89,8 +89,7 @@ def nan_gradient(name: str, every: bool = False) -> Callable[[Trainer], None]:
 
 def nan_value(name: str) -> Callable[[Trainer], None]:
     def change(made: Trainer) -> None:
-        value = made.state.light if name == "light" else made.state.parameters[name]
-        value.data.view(-1)[10:13] = math.nan
+        made.state.learned[name].data.view(-1)[10:13] = math.nan
 
     return change
 
@@ -126,8 +125,15 @@ def trajectories() -> Outcome:
     for dtype in (torch.float32, torch.float64):
         leaves = [v.to(dtype).clone().requires_grad_() for v in start]
         rates = (1e-3, 1e-3, 1e-3, 1e-3, 1e-2)
-        groups = [{"params": [v], "lr": rate} for v, rate in zip(leaves, rates, strict=True)]
-        optimizer = Adam(groups) if dtype == torch.float32 else torch.optim.Adam(groups, eps=Adam.EPSILON)
+        if dtype == torch.float32:
+            optimizer = Learned()
+            for number, (leaf, rate) in enumerate(zip(leaves, rates, strict=True)):
+                optimizer.learn(str(number), leaf)
+                optimizer.rates[str(number)] = rate
+            leaves = [*optimizer.values()]
+        else:
+            groups = [{"params": [v], "lr": rate} for v, rate in zip(leaves, rates, strict=True)]
+            optimizer = torch.optim.Adam(groups, eps=Learned.EPSILON)
         draw = rasterize if dtype == torch.float32 else reference.rasterize
         for _ in range(30):
             picture = draw(*leaves, view, 0.1)[0]
@@ -163,9 +169,7 @@ CUTS: dict[int, Callable[[Trainer], bool]] = {
 
 def bits(made: Trainer) -> list[Tensor]:
     return [
-        *(v.detach() for _, v in sorted(made.state.parameters.items())),
-        made.state.light.detach(),
-        made.state.exposures.detach(),
+        *(value.detach() for _, value in sorted(made.state.learned.items())),
     ]
 
 
@@ -263,7 +267,9 @@ CASES = [
         _case(f"NaN in {name} of surfels", functools.partial(disturbed, nan_value(name)), REMOVED)
         for name in ("position", "scale", "opacity", "albedo", "roughness")
     ),
-    _case("NaN in the light", lambda: disturbed(nan_value("light")), "back to the last checkpoint, and that is said"),
+    _case(
+        "NaN in the light", lambda: disturbed(nan_value("environment")), "back to the last checkpoint, and that is said"
+    ),
     _case(
         "gradients that are never finite again",
         stopped,

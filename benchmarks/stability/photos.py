@@ -34,7 +34,7 @@ def elsewhere(scale: float, offset: float) -> Outcome:
 
     course = train(changed(pose=pose))
     made = course.trainer.state
-    surfels = activate({**made.constant, **made.parameters})
+    surfels = activate(made.learned.constant | made.learned.by_row)
     to_capture = made.capture.to_capture
     place = surfels.positions.detach().numpy().astype(float) @ to_capture[:3, :3].T + to_capture[:3, 3]
     # The 75th percentile, because half of the surfels start inside the object.

@@ -83,8 +83,7 @@ class Course(NamedTuple):
     @property
     def finite(self) -> bool:
         values = [
-            *self.trainer.state.parameters.values(),
-            self.trainer.state.light,
+            *self.trainer.state.learned.values(),
             *(v.color for v in map(self._seen, self.trainer.state.test)),
         ]
         return all(bool(value.isfinite().all()) for value in values) and all(np.isfinite(list(self.psnr.values())))

@@ -25,9 +25,9 @@ def show(made, *, metallic, roughness, albedo=ORANGE, exposure=(1.0,), turn=Fals
     if turn:
         state.change("light.frame", "camera", "photos", "the test turns it")
     with torch.no_grad():
-        directions = cubemap.texel_directions(math.isqrt(len(state.light) // 6)).float()
+        directions = cubemap.texel_directions(math.isqrt(len(state.learned["environment"]) // 6)).float()
         bright = (directions @ lamps.T > 0.85).any(dim=1, keepdim=True)
-        state.light.copy_(torch.where(bright, lamp, -1.5).expand(-1, 3))
+        state.learned["environment"].copy_(torch.where(bright, lamp, -1.5).expand(-1, 3))
         inputs = state.inputs()
         for view, photo in enumerate(state.photos):
             factor = 0.5 * exposure[view % len(exposure)]

@@ -51,8 +51,8 @@ def trained(*arguments, **options) -> Trainer:
 
 
 def learned(made: Trainer) -> dict[str, torch.Tensor]:
-    """Copy what a training has learned: the surfels' parameters by name, and the light as "light"."""
-    return {name: v.detach().clone() for name, v in (made.state.parameters | {"light": made.state.light}).items()}
+    """Copy what a training has learned: the surfels' parameters, light ("environment") and exposures ("exposure")."""
+    return {name: value.detach().clone() for name, value in made.state.learned.items()}
 
 
 def check_equal(one: Trainer, other: Trainer) -> None:
@@ -68,7 +68,7 @@ def put(made: Trainer, **values) -> None:
     """Set parameters of all surfels. `values` maps a parameter's name to its new raw value (before the activation)."""
     with torch.no_grad():
         for name, value in values.items():
-            made.state.parameters[name][:] = torch.as_tensor(value)
+            made.state.learned[name][:] = torch.as_tensor(value)
 
 
 def asset_error(made: Trainer) -> float:

@@ -36,7 +36,7 @@ def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
             emulate(monkeypatch)
         steps = [made.step() for _ in range(3)]
         figures.append([[float(step[name]) for name in ("loss", "square")] for step in steps])
-        values.append(made.state.parameters)
+        values.append(made.state.learned.by_row)
     np.testing.assert_allclose(figures[0], figures[1], rtol=1e-3)
     for name, value in values[0].items():
         # Adam's first steps follow the sign of the gradient, which rounding may flip where gradients are tiny.
@@ -123,10 +123,10 @@ def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, ind
             tree._boxes, tree._triangles = (torch.empty(v.shape, device=CARD) for v in (tree._boxes, tree._triangles))
             made.state.occluder = ball
         # The training computes at its start which texels of the light the object shows.
-        made.state.light_shown = torch.empty(len(made.state.light), device=CARD)
+        made.state.light_shown = torch.empty(len(made.state.learned["environment"]), device=CARD)
         figures = made.step()
         assert all(figure.device == CARD for figure in figures.values())
-        assert all(value.grad is None and value.device == CARD for value in made.state.parameters.values())
+        assert all(value.grad is None and value.device == CARD for value in made.state.learned.values())
     stages = ["activate", "sparse", "raster_project", "raster_forward", "shade_forward"]
     stages += ["losses", "ssim", "raster_backward", "adam"]
     for stage in stages + ["trace", "harmonics"] * indirect:

@@ -28,7 +28,7 @@ def told(made):
     state = made.state
     found = changes.observe(state)
     usable = found.usable.any(dim=1)
-    metal = changes.shines_as_metal(found, state.parameters["position"].detach()).clearly
+    metal = changes.shines_as_metal(found, state.learned["position"].detach()).clearly
     change = changes.change_seen(found, state.wanted())
     return float(metal[usable].float().mean()), change
 
@@ -68,7 +68,7 @@ def falls(made):
     state = made.state
     found = changes.observe(state)
     light = float(state.environment().radiance.detach().mean())
-    metal = changes.falls_as_metal(found, state.parameters["position"].detach(), light)
+    metal = changes.falls_as_metal(found, state.learned["position"].detach(), light)
     return float(metal[found.usable.any(dim=1)].float().mean())
 
 
@@ -97,7 +97,7 @@ def test_a_small_part_that_shines_counts(made):
 
 def explanation(made):
     """Explain the changes of all surfels."""
-    found, positions = changes.observe(made.state), made.state.parameters["position"].detach()
+    found, positions = changes.observe(made.state), made.state.learned["position"].detach()
     (whole,) = explained(found, positions, made.state.capture.radius, torch.ones(len(positions), dtype=torch.bool))
     return whole
 
@@ -124,7 +124,7 @@ def test_coloured_noise_does_not_make_metal(made):
     state = made.state
     state.change("render.reflection", "none", "needs", "the test has a matte ball")
     generator = torch.Generator().manual_seed(3)
-    positions = state.parameters["position"].detach() / state.capture.radius
+    positions = state.learned["position"].detach() / state.capture.radius
     photos = []
     for view in range(len(state.photos)):
         waves, phases = 6 * torch.randn(3, 12, generator=generator), 6 * torch.rand(12, generator=generator)
@@ -158,12 +158,12 @@ def test_metals_are_set_once(made):
     metals.set_metals_due(state, 0.05)
     assert not state.metals_set and "metals" not in state.decided
     metals.set_metals_due(state, 0.25)
-    metallic = activate({**state.constant, **state.parameters} | {"metallic": state.parameters["metallic"]}).metallic
+    metallic = activate(state.learned.constant | state.learned.by_row).metallic
     assert state.metals_set and float((metallic > metals.METAL - 1e-3).float().mean()) > 0.5
     assert "as metals do" in state.decided["metals"] and state.settings.loss.dark == 0
     put(made, metallic=0.0)
     metals.set_metals_due(state, 0.3)
-    assert (state.parameters["metallic"] == 0).all()
+    assert (state.learned["metallic"] == 0).all()
 
 
 def test_propagation_finds_metals_by_itself(large_ball, tmp_path):
@@ -172,7 +172,7 @@ def test_propagation_finds_metals_by_itself(large_ball, tmp_path):
     put(made, metallic=0.0)
     made.state.iteration = metals.SOONEST
     metals.set_metals_due(made.state, 0.25)
-    assert not made.state.metals_set and (made.state.parameters["metallic"] == 0).all()
+    assert not made.state.metals_set and (made.state.learned["metallic"] == 0).all()
 
 
 @pytest.mark.parametrize("roughness", [-1.0, 1.0])  # rough metal changes by less than may be texture out of place
@@ -183,39 +183,37 @@ def test_what_is_metal_all_over_is_held(made, roughness):
     put(made, metallic=0.0)
     state.iteration = metals.SOONEST
     metals.set_metals_due(state, 0.25)
-    held = int((state.parameters["metallic"] == metals.HELD[0]).sum())
-    assert held > 0.9 * len(state.parameters["metallic"])
-    before = state.parameters["roughness"].detach().clone()
+    held = int((state.learned["metallic"] == metals.HELD[0]).sum())
+    assert held > 0.9 * len(state.learned["metallic"])
+    before = state.learned["roughness"].detach().clone()
     for _ in range(5):
         made.step()
-    assert int((state.parameters["metallic"] == metals.HELD[0]).sum()) == held
-    assert not torch.equal(state.parameters["roughness"], before)
-    gradient = torch.ones(len(state.parameters["position"]))
-    divided = densify(
-        state.parameters, state.optimizer, gradient, state.settings.densify, 2 * len(gradient), divide=True
-    )
+    assert int((state.learned["metallic"] == metals.HELD[0]).sum()) == held
+    assert not torch.equal(state.learned["roughness"], before)
+    gradient = torch.ones(state.learned.count)
+    divided = densify(state.learned, gradient, state.settings.densify, 2 * len(gradient), divide=True)
     state.reset_motion()
     made.step()
     assert divided > 0
-    assert int((state.parameters["metallic"] == metals.HELD[0]).sum()) > held + 0.9 * divided
+    assert int((state.learned["metallic"] == metals.HELD[0]).sum()) > held + 0.9 * divided
 
 
 @pytest.mark.parametrize("albedo, even", [(ORANGE, True), ([1.0, 1.0, 1.0], False)])
 def test_paint_is_averaged_on_coloured_metal_only(made, albedo, even):
     """Check that base colours differ less where the surface is coloured metal, and are left alone elsewhere and late in the training."""
     state = made.state
-    upper = state.parameters["position"].detach()[:, 2] > 0
+    upper = state.learned["position"].detach()[:, 2] > 0
     noise = 0.5 * torch.randn(len(upper), 1, generator=torch.Generator().manual_seed(0))
     paint = torch.tensor(albedo) + noise  # brighter and darker
     put(made, metallic=torch.where(upper, 6.0, -6.0), albedo=paint, opacity=2.0)
     state.metals_set, state.iteration = True, even_metal.EVERY
     even_metal.even_out_due(state, even_metal.UNTIL)
-    assert torch.equal(state.parameters["albedo"], paint)
+    assert torch.equal(state.learned["albedo"], paint)
     even_metal.even_out_due(state, 0.5)
-    found = state.parameters["albedo"].detach() - torch.tensor(albedo)
-    assert torch.equal(state.parameters["albedo"][~upper], paint[~upper])
+    found = state.learned["albedo"].detach() - torch.tensor(albedo)
+    assert torch.equal(state.learned["albedo"][~upper], paint[~upper])
     if even:
         assert float(found[upper].std()) < 0.35 * float(noise[upper].std())  # of 16 neighbours: 1/4
         assert float(found[upper].mean()) == pytest.approx(float(noise[upper].mean()), abs=0.03)
     else:
-        assert torch.equal(state.parameters["albedo"], paint)
+        assert torch.equal(state.learned["albedo"], paint)

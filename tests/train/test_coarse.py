@@ -135,8 +135,8 @@ def test_large_photos_are_held_once_and_leave_no_files(ball_capture, tmp_path, l
     monkeypatch.setattr(cached, "load_view", None)  # the resumed training reads no photo
     state = train(tmp_path / "run", resume=True)
     assert state.ended and not (tmp_path / "run" / "photos").exists()
-    for name, value in held.parameters.items():
-        torch.testing.assert_close(value, state.parameters[name], rtol=0, atol=0)
+    for name, value in held.learned.items():
+        torch.testing.assert_close(value, state.learned[name], rtol=0, atol=0)
 
 
 def test_photos_that_could_not_all_be_read_leave_no_files(ball_capture, tmp_path, monkeypatch):

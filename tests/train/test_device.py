@@ -82,18 +82,18 @@ def test_full_memory_lowers_the_budget_and_goes_on(ball_capture, tmp_path, monke
     step = made.step
 
     def limited() -> dict:
-        if len(made.state.parameters["position"]) > 1800:
+        if made.state.learned.count > 1800:
             raise torch.OutOfMemoryError
         return step()
 
     with torch.no_grad():
-        made.state.parameters["opacity"][:400] -= 1
+        made.state.learned["opacity"][:400] -= 1
     monkeypatch.setattr(made, "step", limited)
     assert made.run()
     (warning,) = [facts["what"] for event, facts in reports if event == "warning"]
     assert "1,600 surfels" in warning
-    assert made.state.settings.surfels.budget == len(made.state.parameters["position"]) == 1600
-    assert made.state.parameters["opacity"].min() > 0
+    assert made.state.settings.surfels.budget == made.state.learned.count == 1600
+    assert made.state.learned["opacity"].min() > 0
 
 
 def test_memory_that_is_far_too_small(ball_capture, tmp_path, monkeypatch):

@@ -10,22 +10,25 @@ from benchmarks.stability.optimisation import nan_gradient, nan_value, resumed
 from benchmarks.stability.training import ball, changed, trainer
 from refgs.capture import read_capture
 from refgs.errors import InputError
-from refgs.model.adam import Adam
 from refgs.model.environment import Environment
+from refgs.model.learned import Learned
 from refgs.render.baselines import LINEAR, SCREEN
 from refgs.render.directional import directional
 from refgs.render.rasterize import rasterize
 from refgs.render.shade import shade
 from refgs.settings import load_settings
-from refgs.train.learn.densify import faint
-from refgs.train.learn.guard import MOST_IN_A_ROW, Guard, limits, remove_broken, running
+from refgs.train.learn.guard import MOST_IN_A_ROW, Guard, remove_broken, running
 from refgs.train.screen_gradient import ScreenGradient
+from refgs.train.timeline import faint
 from tests.makers import scenes
 
 
 def learner(device):
-    values = [torch.randn(50, 3, device=device).requires_grad_(), torch.randn(20, device=device).requires_grad_()]
-    return values, Adam([{"params": [v], "name": n, "lr": 0.1} for v, n in zip(values, "ab", strict=True)])
+    learned = Learned()
+    for name, value in (("a", torch.randn(50, 3, device=device)), ("b", torch.randn(20, device=device))):
+        learned.learn(name, value)
+        learned.rates[name] = 0.1
+    return [*learned.values()], learned
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1e30])
@@ -34,33 +37,34 @@ def test_a_step_that_is_not_finite_leaves_all_as_it_was(device, wrong):
 
     A gradient of 1e30 is rejected too, because its square overflows float32.
     """
-    values, optimizer = learner(device)
+    values, learned = learner(device)
     guard, motion = Guard(torch.device(device)), ScreenGradient(50, torch.device(device))
     for step in range(3):
         before = [v.detach().clone() for v in values]
-        moments = [{k: torch.as_tensor(v).clone() for k, v in optimizer.state[p].items()} for p in values]
+        moments = {name: (kept.mean.clone(), kept.square.clone()) for name, kept in learned.moments.items()}
         loss = sum((v**2).sum() for v in values)
         loss.backward()
         if step == 1:
             values[0].grad[7, 1] = wrong
-        accepted = guard.judge(loss, optimizer)
+        accepted = guard.judge(loss, learned)
         motion.add(values[0].detach(), values[0].grad, scenes.camera(), accepted)
-        optimizer.step(accepted)
+        learned.step(accepted)
         assert float(accepted) == (step != 1)
         same = all(torch.equal(a, b) for a, b in zip(values, before, strict=True))
         assert same == (step == 1)
         if step == 1:
-            for value, was in zip(values, moments, strict=True):
-                assert all(torch.equal(optimizer.state[value][k], was[k]) for k in ("exp_avg", "exp_avg_sq"))
-        for value in values:
-            value.grad = None
+            assert moments.keys() == {"a", "b"}
+            for name, (mean, square) in moments.items():
+                kept = learned.moments[name]
+                assert torch.equal(kept.mean, mean) and torch.equal(kept.square, square)
+        learned.forget_gradients()
     assert motion.total.isfinite().all() and float(motion.views.max()) <= 2
 
 
 def test_a_loss_that_is_no_number_is_not_stepped_on():
-    values, optimizer = learner("cpu")
+    values, learned = learner("cpu")
     sum((v**2).sum() for v in values).backward()
-    assert float(Guard(torch.device("cpu")).judge(torch.tensor(math.nan), optimizer)) == 0
+    assert float(Guard(torch.device("cpu")).judge(torch.tensor(math.nan), learned)) == 0
 
 
 def test_no_kernel_hides_what_is_no_number(device):
@@ -87,20 +91,22 @@ def test_no_kernel_hides_what_is_no_number(device):
 
 
 def test_values_stay_within_limits(device):
-    value = torch.zeros(40, device=device)
-    optimizer = Adam([{"params": [value], "lr": 5.0, "limits": (-12.0, 3.0)}])
+    learned = Learned(brightest=3.0)
+    learned.learn("environment", torch.zeros(40, device=device), by_row=False)
+    value, learned.rates["environment"] = learned["environment"], 5.0
     for sign, ends in ((1, [3, -12]), (-1, [-12, 3])):  # a value at a limit leaves it when its gradient points away
         for _ in range(20):
             value.grad = sign * torch.linspace(-1, 1, 40, device=device)
-            optimizer.step()
+            learned.step()
         assert value[[0, -1]].tolist() == ends and (float(value.max()), float(value.min())) == (3, -12)
 
 
 def test_limits_keep_to_the_scenes_size():
-    assert limits("position", 2.0, LINEAR.brightest) == (-math.inf, math.inf)
-    low, high = limits("scale", 2.0, LINEAR.brightest)
+    learned = Learned(2.0, LINEAR.brightest)
+    assert learned.limits("position") == (-math.inf, math.inf)
+    low, high = learned.limits("scale")
     assert math.exp(low) == pytest.approx(2e-6) and math.exp(high) == pytest.approx(200)
-    assert limits("environment", 1.0, SCREEN.brightest)[1] < limits("environment", 1.0, LINEAR.brightest)[1]
+    assert Learned(1.0, SCREEN.brightest).limits("environment")[1] < learned.limits("environment")[1]
 
 
 def test_a_mean_passes_over_what_is_no_number():
@@ -132,20 +138,20 @@ def test_broken_surfels_are_removed_and_that_is_said(ball_capture, tmp_path):
     made.run(stop=lambda: made.state.iteration >= 15)
     nan_value("roughness")(made)
     nan_value("position")(made)  # not drawn, so it has no gradient
-    count = len(made.state.parameters["position"])
+    count = made.state.learned.count
     made.run(stop=lambda: made.state.iteration >= 30)
-    broken = count - len(made.state.parameters["position"])
-    assert 4 <= broken <= 6 and all(v.isfinite().all() for v in made.state.parameters.values())
+    broken = count - made.state.learned.count
+    assert 4 <= broken <= 6 and all(v.isfinite().all() for v in made.state.learned.by_row.values())
     assert any("not taken" in line for line in said) and any("removed" in line for line in said)
-    assert len(made.state.motion.total) == len(made.state.parameters["position"])
+    assert len(made.state.motion.total) == made.state.learned.count
 
 
 def test_a_broken_light_goes_back_to_the_checkpoint(ball_capture, tmp_path):
     said = []
     made = trainer(ball_capture, total=60, said=said, folder=tmp_path)
     made.run(stop=lambda: made.state.iteration >= 20)
-    nan_value("light")(made)
-    assert made.run() and made.state.light.isfinite().all()
+    nan_value("environment")(made)
+    assert made.run() and made.state.learned["environment"].isfinite().all()
     assert any("going back to that of 20" in line for line in said)
 
 
@@ -164,9 +170,10 @@ def test_a_training_that_cannot_go_on_ends_with_one_line(ball_capture, tmp_path)
 
 
 def test_no_surfel_left_is_said():
-    parameters = {"position": torch.full((3, 3), math.nan, requires_grad=True)}
+    learned = Learned()
+    learned.learn("position", torch.full((3, 3), math.nan))
     with pytest.raises(InputError, match="no surfel"):
-        remove_broken(parameters, Adam([{"params": [parameters["position"]], "name": "position"}]))
+        remove_broken(learned)
 
 
 def test_resumed_in_every_stage_it_is_the_same_run():

@@ -9,7 +9,7 @@ import torch
 from benchmarks.scenes.analytic import write_ball_capture
 from refgs import train_job
 from refgs.errors import InputError
-from refgs.formats.hints import FILE, KINDS, Hint, read_hints, write_hints
+from refgs.formats.hints import FILE, Hint, read_hints, write_hints
 from refgs.formats.splats import read_splats
 from refgs.run_folder import read_run_facts
 from refgs.train.decide import needs
@@ -22,7 +22,7 @@ from refgs.train.material import metals
 from tests.makers.training import TINY, put, trained, trainer
 
 TOTAL = 400
-METAL, PAINT = (metals.HELD[KINDS.index(kind)] for kind in ("metal", "paint"))
+METAL, PAINT = metals.HELD
 
 
 def silent(event, facts):
@@ -36,7 +36,7 @@ def plastic(ball_capture, tmp_path_factory):
     Afterwards, the paint is held no more.
     """
     made = trainer(ball_capture, tmp_path_factory.mktemp("runs") / "run", *TINY, total=TOTAL)
-    metals.hold_as(made.state, torch.ones(len(made.state.parameters["position"]), dtype=torch.long))
+    metals.hold_as(made.state, torch.ones(made.state.learned.count, dtype=torch.long))
     made.run()
     write_asset(made.state)
     quality = held_out_psnr(made.state, most=9)
@@ -63,7 +63,7 @@ def go_on(capture, out, run, file, *, minutes=None, attend=lambda state: False, 
 
 
 def count(state, raw) -> int:
-    return int((state.parameters["metallic"] == raw).sum())
+    return int((state.learned["metallic"] == raw).sum())
 
 
 def test_a_mirror_learned_as_plastic_becomes_metal(plastic, ball_capture, tmp_path):
@@ -80,7 +80,7 @@ def test_a_mirror_learned_as_plastic_becomes_metal(plastic, ball_capture, tmp_pa
 def test_clay_learned_as_rough_metal_becomes_paint(tmp_path):
     write_ball_capture(tmp_path / "clay", 64, matte=True)
     made = trainer(tmp_path / "clay", tmp_path / "run", *TINY, "needs.specular=on", total=150)
-    metals.hold_as(made.state, torch.zeros(len(made.state.parameters["position"]), dtype=torch.long))
+    metals.hold_as(made.state, torch.zeros(made.state.learned.count, dtype=torch.long))
     made.run()
     write_asset(made.state)
     before = held_out_psnr(made.state, most=9)
@@ -96,10 +96,10 @@ def test_what_was_not_hinted_learns(plastic, ball_capture, tmp_path):
     run, out = plastic[0].state.folder, tmp_path / "new"
     state, _ = go_on(ball_capture, out, run, hint_file(run, above=0.1))
     assert state.iteration == TOTAL and checkpoint.complete(out / "checkpoints") == [round(AGAIN * TOTAL), TOTAL]
-    upper = state.parameters["position"][:, 2].detach() > 0.2
-    metallic = state.parameters["metallic"].detach()
+    upper = state.learned["position"][:, 2].detach() > 0.2
+    metallic = state.learned["metallic"].detach()
     assert (metallic[upper] == METAL).float().mean() > 0.97
-    lower = metallic[state.parameters["position"][:, 2].detach() < -0.2]
+    lower = metallic[state.learned["position"][:, 2].detach() < -0.2]
     assert (lower != METAL).float().mean() > 0.97 and len(lower.unique()) > 0.9 * len(lower)
     told = json.loads((out / FILE).read_text())
     assert told["run"] == str(run.resolve()) and len(told["hints"][0]["points"]) > 100
@@ -115,21 +115,19 @@ def test_hinted_halves_are_held_and_so_they_are_after_a_resume(plastic, ball_cap
     state, quality = go_on(ball_capture, out, run, file, attend=lambda state: state.iteration >= AGAIN * TOTAL + 10)
     assert quality is None and not state.ended
     metal, paint = count(state, METAL), count(state, PAINT)
-    assert metal + paint == len(state.parameters["metallic"]) and min(metal, paint) > 100
+    assert metal + paint == len(state.learned["metallic"]) and min(metal, paint) > 100
     gradient = torch.ones(metal + paint)
     with torch.no_grad():
-        divided = densify(
-            state.parameters, state.optimizer, gradient, state.settings.densify, 2 * len(gradient), divide=True
-        )
-    assert divided and count(state, METAL) + count(state, PAINT) == len(state.parameters["metallic"])
+        divided = densify(state.learned, gradient, state.settings.densify, 2 * len(gradient), divide=True)
+    assert divided and count(state, METAL) + count(state, PAINT) == len(state.learned["metallic"])
     state, quality = go_on(ball_capture, out, run, None, resume=True)
     assert state.ended and quality is not None
-    assert count(state, METAL) + count(state, PAINT) == len(state.parameters["metallic"])
+    assert count(state, METAL) + count(state, PAINT) == len(state.learned["metallic"])
 
 
 def test_a_surfel_is_what_the_nearest_splat_is(plastic):
     state = plastic[0].state
-    positions = state.parameters["position"].detach().numpy()
+    positions = state.learned["position"].detach().numpy()
     splats = np.array([[0, 0, 2.0], [0, 0, -2.0], [0, 9.0, 0]])
     hints = [Hint("metal", splats[:2] + 0.1), Hint("paint", splats[1:2])]
     kinds = hinted_kinds(state, splats, hints).numpy()
@@ -143,10 +141,10 @@ def test_metals_come_back_to_a_scene_that_was_taken_for_matte(ball_capture, tmp_
     needs.SPECULAR.apply(made.state, made.state.needs["specular"])
     made.run()
     write_asset(made.state)
-    assert "metallic" not in made.state.parameters
+    assert "metallic" not in made.state.learned
     again = trainer(ball_capture, tmp_path / "again", *TINY, total=40)
     continue_with_hints(again.state, made.state.folder, of_splats(made.state.folder))
-    assert count(again.state, METAL) == len(again.state.parameters["position"])
+    assert count(again.state, METAL) == again.state.learned.count
     assert again.state.settings.render.reflection == "microfacet"
     again.run()
     assert again.state.ended and count(again.state, METAL) > 0

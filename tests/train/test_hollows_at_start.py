@@ -26,7 +26,7 @@ def start(folder, run, *changes: str) -> tuple[np.ndarray, str]:
     said = []
     settings = Effective.of(load_settings("quick", ["surfels.start=2000", "surfels.inside=0", *changes]))
     state = set_up(read_capture(folder), settings, run, lambda *event: said.append(str(event)), Plan(None), "cpu")
-    return state.parameters["position"].detach().numpy(), next(one for one in said if "surfels start" in one)
+    return state.learned["position"].detach().numpy(), next(one for one in said if "surfels start" in one)
 
 
 def on_lid(positions: np.ndarray) -> float:

@@ -112,8 +112,8 @@ def test_exposures_are_learned_where_photos_differ(tmp_path):
     assert held_out_psnr(with_them.state) > held_out_psnr(without.state) + 1
     index = [int(view.camera.name.partition("_")[2].partition(".")[0]) for view in with_them.state.views]
     truth = np.array([STOPS[i % len(STOPS)] for i in index])
-    assert with_them.state.exposures.shape[1] == 1 and "not in white" in with_them.state.decided["exposures"]
-    found = with_them.state.exposures.detach().numpy()[:, 0] / np.log(2)
+    assert with_them.state.learned["exposure"].shape[1] == 1 and "not in white" in with_them.state.decided["exposures"]
+    found = with_them.state.learned["exposure"].detach().numpy()[:, 0] / np.log(2)
     assert np.abs(found - truth).max() < 0.2
     frames = json.loads((tmp_path / "auto" / "cameras.json").read_text())["frames"]
     factors = [frame.get("exposure") for frame in frames if frame["split"] == "train"]
@@ -143,5 +143,5 @@ def test_exposures_cost_nothing_where_photos_agree(ball_capture, tmp_path):
     without, asked = (
         trained(ball_capture, tmp_path / e, METAL, f"light.exposure={e}", total=300) for e in ("off", "auto")
     )
-    assert asked.state.exposures is None and "no exposures of their own" in asked.state.decided["exposures"]
+    assert "exposure" not in asked.state.learned and "no exposures of their own" in asked.state.decided["exposures"]
     assert abs(held_out_psnr(asked.state) - held_out_psnr(without.state)) < 0.3

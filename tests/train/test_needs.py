@@ -23,11 +23,11 @@ from refgs.train.decide import iterations, lighting, needs, photos
 from refgs.train.decide.materials import CHANGES
 from refgs.train.keep.asset import write_asset
 from refgs.train.keep.measures import held_out_psnr
-from refgs.train.learn.densify import RESET, SEEN, faint_now
 from refgs.train.learn.losses import objective
 from refgs.train.photo import Photo
 from refgs.train.plan import Plan
 from refgs.train.state import why_not_traced
+from refgs.train.timeline import RESET, SEEN, faint_now
 from tests.makers.occluders import as_occluder, plate
 from tests.makers.training import asset_error, check_equal, put
 from tests.makers.training import trainer as small
@@ -65,7 +65,7 @@ def test_what_is_matte_goes_without_specular(chalk):
     assert not found["needed"] and found["statistic"] < found["threshold"] and found["megabytes"] > 0
     assert chalk.state.settings.render.reflection == "none" and chalk.state.settings.environment.resolution == 16
     left = {"metallic", "roughness", "indirect_dc", "indirect_rest", "received"}
-    assert not left & {*chalk.state.parameters} and not left & {g["name"] for g in chalk.state.optimizer.param_groups}
+    assert not left & {*chalk.state.learned} and not left & {*chalk.state.learned.moments}
     assert held_out_psnr(chalk.state) > 35
 
 
@@ -93,11 +93,11 @@ def test_a_convex_mirror_keeps_specular_and_does_without_reflections(ball_captur
     made = trainer(ball_capture, tmp_path / "run", "surfels.metallic=0.9", total=150)
     made.run(stop=lambda: made.state.iteration == 110)
     found = made.state.needs["specular"]
-    assert found["needed"] and found["statistic"] > 1 and "metallic" in made.state.parameters
+    assert found["needed"] and found["statistic"] > 1 and "metallic" in made.state.learned
     assert made.state.settings.render.reflection == "microfacet" and made.state.total == 150
     found = made.state.needs["reflections"]
     assert not found["needed"] and found["statistic"] < found["threshold"]
-    assert made.state.occluder is None and "received" not in made.state.parameters and why_not_traced(made.state)
+    assert made.state.occluder is None and "received" not in made.state.learned and why_not_traced(made.state)
 
 
 @pytest.mark.parametrize("word", ["on", "off"])
@@ -105,7 +105,7 @@ def test_forced_either_way(word, matte, ball_capture, tmp_path):
     """Check that the setting needs.specular (on or off) overrides the automatic choice whether to train specular shading."""
     made = trainer(matte if word == "on" else ball_capture, tmp_path / "run", f"needs.specular={word}", total=120)
     made.run()
-    assert ("metallic" in made.state.parameters) == (word == "on")
+    assert ("metallic" in made.state.learned) == (word == "on")
     write_asset(made.state)
     rows = {row.get("need"): row for row in json.loads((tmp_path / "run" / "needs.json").read_text())}
     assert (word == "off") == ("specular" in rows)
@@ -186,7 +186,7 @@ def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
     decided = dict(made.state.needs)
     assert not decided["specular"]["needed"]
     made.resume()
-    assert made.state.iteration == 96 and made.state.needs == decided and "metallic" not in made.state.parameters
+    assert made.state.iteration == 96 and made.state.needs == decided and "metallic" not in made.state.learned
     assert made.state.total == decided["iterations"]["total"] < 200
     made.step()
 
@@ -201,7 +201,7 @@ def test_a_scene_that_was_taken_for_matte_gets_its_gloss_back(matte, ball_captur
     made = trainer(matte, tmp_path / "run", *options, total=300)
     state = made.state
     made.run(stop=lambda: "specular" in state.needs)
-    assert not state.needs["specular"]["needed"] and "metallic" not in state.parameters
+    assert not state.needs["specular"]["needed"] and "metallic" not in state.learned
     assert state.total == state.needs["iterations"]["total"] < 300
     while 2 * state.iteration < state.total - 2:
         made.step()
@@ -212,20 +212,20 @@ def test_a_scene_that_was_taken_for_matte_gets_its_gloss_back(matte, ball_captur
         made.step()
     found = state.needs["specular"]
     assert found["needed"] and found["statistic"] >= found["threshold"] and "halfway" in state.decided["specular"]
-    assert {"metallic", "roughness", "received"} <= {*state.parameters} and state.total == 300
+    assert {"metallic", "roughness", "received"} <= {*state.learned} and state.total == 300
     assert state.settings.render.reflection == "microfacet" and "iterations" not in state.needs
     assert state.effective.rows()["train.iterations"]["became"] == 300
-    before = state.parameters["roughness"].detach().clone()
+    before = state.learned["roughness"].detach().clone()
     for _ in range(5):
         made.step()
-    assert (state.parameters["roughness"] - before).abs().max() > 0 and len(before) == len(state.parameters["position"])
+    assert (state.learned["roughness"] - before).abs().max() > 0 and len(before) == state.learned.count
     made.resume()  # the checkpoint before it was taken back
-    assert 2 * state.iteration < state.total and {"metallic", "roughness"} <= {*state.parameters}
+    assert 2 * state.iteration < state.total and {"metallic", "roughness"} <= {*state.learned}
     made.step()
     made.save()
     again = trainer(matte, tmp_path / "run", *options, total=300)
     again.resume()
-    assert again.state.needs == state.needs and "metallic" in again.state.parameters and again.state.total == 300
+    assert again.state.needs == state.needs and "metallic" in again.state.learned and again.state.total == 300
 
 
 def test_what_a_setting_leaves_out_stays_out_when_gloss_comes_back(matte, tmp_path):
@@ -266,13 +266,13 @@ def test_reflections_of_a_small_part_are_kept(ball_capture, tmp_path, hidden):
     made = trainer(ball_capture, tmp_path / "run", "surfels.metallic=0.9", total=150)
     made.run(stop=lambda: made.state.iteration == 99)
     state = made.state
-    top = state.parameters["position"][:, 2] > 0.97
+    top = state.learned["position"][:, 2] > 0.97
     for chrome in (True, False):
         put(made, metallic=-10, albedo=0, roughness=5)
         with torch.no_grad():
-            state.parameters["metallic"][top & chrome] = 5
-            state.parameters["roughness"][top & chrome] = -3
-            state.parameters["albedo"][top & chrome] = 3
+            state.learned["metallic"][top & chrome] = 5
+            state.learned["roughness"][top & chrome] = -3
+            state.learned["albedo"][top & chrome] = 3
         state.occluder = None
         state.photos = [with_rendering(state, p, noise=0.1)._replace(mask=p.mask) for p in state.photos]
         state.occluder = as_occluder(plate(1.2, -1), scale=0.9)
@@ -315,9 +315,9 @@ def test_the_part_about_the_mask_is_all_that_counts(ball_capture, tmp_path):
         rendering = made.state.picture(made.state.inputs(), photo.camera)
         found = objective(rendering, None, photo, made.state.background, made.state.losses, 0.5)
         found.loss.backward()
-        by = {name: value.grad.clone() for name, value in made.state.parameters.items() if value.grad is not None}
+        by = {name: value.grad.clone() for name, value in made.state.learned.by_row.items() if value.grad is not None}
         results.append((found, by))
-        made.state.forget_gradients()
+        made.state.learned.forget_gradients()
     (one, by_one), (other, by_other) = results
     torch.testing.assert_close(one.loss, other.loss, rtol=1e-5, atol=0)
     torch.testing.assert_close(one.square, other.square, rtol=1e-5, atol=0)
@@ -387,7 +387,7 @@ def test_degrees_by_what_they_are_worth(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", *changes, total=10)
     made.run(stop=lambda: made.state.iteration == 6)
     for kept in (15, 8, 3, 0):
-        rest = made.state.parameters["sh_rest"]
+        rest = made.state.learned["sh_rest"]
         with torch.no_grad():
             rest[:] = 0.1 * torch.randn(rest.shape, generator=torch.Generator().manual_seed(0))
             rest[:, kept:] = 0
@@ -395,7 +395,7 @@ def test_degrees_by_what_they_are_worth(ball_capture, tmp_path):
                 made.state.photos[view] = with_rendering(made.state, photo)
         made.state.needs.pop("degrees", None)
         needs.evaluate_due(made.state, "iteration", progress=1.0)
-        assert made.state.parameters["sh_rest"].shape[1] == kept
+        assert made.state.learned["sh_rest"].shape[1] == kept
         assert made.state.needs["degrees"]["needed"] == (kept == 15)
     made.step()
 
@@ -424,11 +424,11 @@ def test_specular_on_synthetic_surfels(ball_capture, tmp_path):
     The photos are renderings of the model itself.
     """
     made = trainer(ball_capture, tmp_path / "run", total=10)
-    light = torch.randn(made.state.light.shape, generator=torch.Generator().manual_seed(1))
+    light = torch.randn(made.state.learned["environment"].shape, generator=torch.Generator().manual_seed(1))
     for metallic, roughness, least, most in ((5.0, -3.0, 3.0, math.inf), (-20.0, 20.0, -math.inf, 0.3)):
         put(made, metallic=metallic, roughness=roughness)
         with torch.no_grad():
-            made.state.light.copy_(light)
+            made.state.learned["environment"].copy_(light)
             for view, photo in enumerate(made.state.photos):
                 made.state.photos[view] = with_rendering(made.state, photo, noise=0.01)
         assert least < probe.specular_explains(made.state).whole < most
@@ -447,7 +447,7 @@ def test_what_a_small_part_loses_is_told_apart(ball_capture, tmp_path, mask):
         state.surfels(), [state.photo(view) for view in probe.spread_views(state)], state.near
     )
     seen = shares.sum(dim=0)
-    nearest = (state.parameters["position"] - state.parameters["position"][seen.argmax()]).norm(dim=1).argsort()
+    nearest = (state.learned["position"] - state.learned["position"][seen.argmax()]).norm(dim=1).argsort()
     patch = nearest[: 1 + int((seen[nearest].cumsum(dim=0) < 0.008 * seen.sum()).sum())]
     for view, photo in enumerate(state.photos):
         clean = with_rendering(state, photo, noise=0.1)

@@ -25,15 +25,17 @@ def learned(ball_capture, tmp_path_factory):
 
 def test_it_learns_when_material_and_light_have(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", *CHANGES, total=60)
-    rest = made.state.parameters["sh_rest"]
+    rest = made.state.learned["sh_rest"]
     for _ in range(30):
         made.step()
         assert made.state.surfels().sh_rest.shape[1] == 0 or made.state.iteration == 30
-    assert not rest.any() and rest not in made.state.optimizer.state
-    stays = [made.state.parameters[name] for name in ("albedo", "metallic", "roughness")] + [made.state.light]
-    before = [value.detach().clone() for value in (*stays, made.state.parameters["position"])]
+    assert not rest.any() and "sh_rest" not in made.state.learned.moments
+    stays = [made.state.learned[name] for name in ("albedo", "metallic", "roughness")] + [
+        made.state.learned["environment"]
+    ]
+    before = [value.detach().clone() for value in (*stays, made.state.learned["position"])]
     made.step()
-    assert rest.any() and not torch.equal(made.state.parameters["position"], before.pop())
+    assert rest.any() and not torch.equal(made.state.learned["position"], before.pop())
     assert all(torch.equal(value, was) for value, was in zip(stays, before, strict=True))
 
 
@@ -81,7 +83,7 @@ def test_one_that_ends_before_it_leaves_none(ball_capture, tmp_path):
 
 def test_without_it_no_harmonics_are_left(ball_capture, tmp_path):
     made = trained(ball_capture, tmp_path / "run", *CHANGES, "residual.start=1", total=10)
-    assert "sh_rest" not in made.state.parameters
+    assert "sh_rest" not in made.state.learned
     assert open_run(tmp_path / "run").splats.sh.shape[1] == 1
     left = json.loads((tmp_path / "run" / "needs.json").read_text(encoding="utf-8"))
     assert "spherical harmonics" in [one["what"] for one in left]

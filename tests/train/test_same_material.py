@@ -183,8 +183,8 @@ def test_how_much_of_the_surface_is_in_doubt_is_said(made):
     """Check a metal ball that photos show clearly, and a light that is the same from everywhere, under which they tell nothing."""
     show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
     doubt, facts = metals.doubt(made.state)
-    assert len(doubt) == len(made.state.parameters["position"]) and facts["part"] < 0.05
-    made.state.light.data[:] = made.state.light.data.mean()
+    assert len(doubt) == made.state.learned.count and facts["part"] < 0.05
+    made.state.learned["environment"].data[:] = made.state.learned["environment"].data.mean()
     doubt, facts = metals.doubt(made.state)
     assert facts["part"] > 0.9 and facts["what"] == made.state.decided["doubt"]
     assert facts["what"] == f"photos do not tell metal from paint on {facts['part']:.0%} of the surface"
@@ -192,7 +192,7 @@ def test_how_much_of_the_surface_is_in_doubt_is_said(made):
 
 def test_the_asset_has_the_doubt_of_the_surfels_that_are_written(made):
     show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
-    position, light = made.state.parameters["position"], made.state.light
+    position, light = made.state.learned["position"], made.state.learned["environment"]
     position.data[0] = 0  # within the ball, so that no photo shows it
     light.data[:] = light.data.mean()
     doubt, facts = metals.doubt(made.state)
@@ -206,7 +206,7 @@ def test_the_asset_has_the_doubt_of_the_surfels_that_are_written(made):
 
 def test_metals_that_are_held_are_not_in_doubt(made):
     show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
-    made.state.light.data[:] = made.state.light.data.mean()
+    made.state.learned["environment"].data[:] = made.state.learned["environment"].data.mean()
     put(made, metallic=float(metals.HELD[0]))
     facts = metals.doubt(made.state)[1]
     assert facts["part"] < 0.002 and "what" not in facts, "only what hardly any pixel shows is"
@@ -222,15 +222,15 @@ def test_half_a_mirror_makes_all_of_it_metal(made):
     show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
     state = made.state
     shown = mirrored.observe(state)[1].pixels > same_material.FRINGE
-    left = shown & (state.parameters["position"][:, 0] < -0.2)
-    state.parameters["metallic"].data[left] = raw_metallic(0.01)
+    left = shown & (state.learned["position"][:, 0] < -0.2)
+    state.learned["metallic"].data[left] = raw_metallic(0.01)
     half = torch.tensor(GOLD).sigmoid() / 2  # photos are rendered at half the light
-    state.parameters["albedo"].data[:] = half.logit()
-    state.parameters["albedo"].data[left] = -3.0
-    state.parameters["roughness"].data[left] = 1.0
+    state.learned["albedo"].data[:] = half.logit()
+    state.learned["albedo"].data[left] = -3.0
+    state.learned["roughness"].data[left] = 1.0
     metals.judge_due(state, 0.25)
     with torch.no_grad():
-        found = activate({**state.constant, **state.parameters})
+        found = activate(state.learned.constant | state.learned.by_row)
     assert float((found.metallic > 0.8)[left].float().mean()) > 0.95
     assert torch.allclose(found.albedo[left].median(dim=0)[0], half, atol=0.05)
     assert float(found.roughness[left].median()) == pytest.approx(1 / (1 + math.exp(3)), abs=0.02)
@@ -254,4 +254,4 @@ def test_materials_are_judged_with_new_meshes_unless_held(made, iteration, progr
     put(made, metallic=before)
     state.iteration = iteration
     metals.judge_due(state, progress)
-    assert bool((state.parameters["metallic"] == torch.tensor(before)).all())
+    assert bool((state.learned["metallic"] == torch.tensor(before)).all())

@@ -31,14 +31,14 @@ def test_the_deferred_stage_keeps_the_geometry_alone(ball_capture, tmp_path):
     assert not any(torch.equal(before[name], start[name]) for name in ("albedo", "sh_dc", "roughness"))
     start_deferred(made.state)
     assert not made.state.initial
-    for name, value in made.state.parameters.items():
+    for name, value in made.state.learned.by_row.items():
         if name in GEOMETRY:
             assert torch.equal(value, before[name]), name
         else:
             assert torch.equal(value, start[name][:1].expand_as(value)), name
-            assert value not in made.state.optimizer.state
-    assert torch.equal(made.state.light, start["light"]) and made.state.light not in made.state.optimizer.state
-    assert made.state.parameters["position"] in made.state.optimizer.state
+            assert name not in made.state.learned.moments
+    assert torch.equal(made.state.learned["environment"], start["environment"])
+    assert "environment" not in made.state.learned.moments and "position" in made.state.learned.moments
 
 
 def test_the_stage_ends_where_the_preset_says(ball_capture, tmp_path):
@@ -82,8 +82,8 @@ def test_all_grow_faint_and_mirrors_grow(ball_capture, tmp_path):
     changes = ["needs.initial=on", "densify.every=100", "densify.reset_every=6", "propagation.every=4"]
     made = trainer(ball_capture, tmp_path / "run", *changes, "propagation.rest=2", total=100)
     with torch.no_grad():  # make half of the surfels mirrors
-        made.state.parameters["metallic"][::2], made.state.parameters["roughness"][::2] = 3.0, -5.0
-        made.state.parameters["metallic"][1::2], made.state.parameters["roughness"][1::2] = 3.0, 5.0
+        made.state.learned["metallic"][::2], made.state.learned["roughness"][::2] = 3.0, -5.0
+        made.state.learned["metallic"][1::2], made.state.learned["roughness"][1::2] = 3.0, 5.0
 
     def step():
         made.step()
@@ -91,9 +91,8 @@ def test_all_grow_faint_and_mirrors_grow(ball_capture, tmp_path):
 
     for _ in range(3):
         before = step()
-    made.state.optimizer.param_groups = [
-        g for g in made.state.optimizer.param_groups if g["name"] not in ("metallic", "roughness")
-    ]
+    for name in ("metallic", "roughness"):  # they keep what was put there
+        made.state.learned[name].requires_grad_(False)
     after = step()
     grown = (after["scale"] - before["scale"]).exp().mean(dim=1)
     assert float(grown[::2].mean()) == pytest.approx(1.5, abs=0.05)
@@ -116,7 +115,7 @@ def test_the_light_diffuses_as_heat_does(ball_capture, tmp_path, waves):
     set_rates(made.state, 0.0)
     angle = torch.pi * waves / 16
     wave = torch.cos(angle * (torch.arange(16) + 0.5))
-    texels = made.state.light.detach().view(6, 16, 16, 3)
+    texels = made.state.learned["environment"].detach().view(6, 16, 16, 3)
     texels[:] = 0.7 + wave[:, None, None]
     texels[1] = 0.7 + wave[:, None]
     diffuse(made.state)
@@ -130,9 +129,11 @@ def test_the_light_fades_to_grey(ball_capture, tmp_path):
     changes = "needs.initial=on", "environment.diffusion=0", "environment.grey=0.2", "rates.environment=0.5"
     made = trainer(ball_capture, tmp_path / "run", *changes, total=10)
     set_rates(made.state, 0.0)
-    made.state.light.data[:] = torch.tensor([0.2, 0.5, 1.1])
+    made.state.learned["environment"].data[:] = torch.tensor([0.2, 0.5, 1.1])
     diffuse(made.state)
-    assert torch.allclose(made.state.light.data, torch.tensor([0.24, 0.51, 1.05]).expand(6 * 16**2, 3), atol=1e-6)
+    assert torch.allclose(
+        made.state.learned["environment"].data, torch.tensor([0.24, 0.51, 1.05]).expand(6 * 16**2, 3), atol=1e-6
+    )
 
 
 def test_the_mean_light_counts_each_pixel_alike():

@@ -67,8 +67,8 @@ def test_the_asset_keeps_surfels_as_they_were_learned(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", total=10)
     made.run()
     with torch.no_grad():
-        w, x, y, z = made.state.parameters["rotation"][::2].unbind(-1)
-        made.state.parameters["rotation"][::2] = torch.stack([-x, w, z, -y], dim=-1)  # flip every other surfel
+        w, x, y, z = made.state.learned["rotation"][::2].unbind(-1)
+        made.state.learned["rotation"][::2] = torch.stack([-x, w, z, -y], dim=-1)  # flip every other surfel
     write_asset(made.state)
     run, camera = open_run(made.state.folder), made.state.test[0].camera
     learned = made.state.render(camera).normal
@@ -132,9 +132,10 @@ def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
     second.run()
     check_equal(whole, second)
     # With STAGES, all surfels are faint when exposures would be decided, so exposures stay.
-    assert (second.state.exposures is not None) == (changes[0] in (TURNING[0], STAGES[0]))
-    if second.state.exposures is not None:
-        assert torch.equal(whole.state.exposures, second.state.exposures) and whole.state.exposures.any()
+    assert ("exposure" in second.state.learned) == (changes[0] in (TURNING[0], STAGES[0]))
+    if "exposure" in second.state.learned:
+        exposures = whole.state.learned["exposure"]
+        assert torch.equal(exposures, second.state.learned["exposure"]) and exposures.any()
     assert (second.state.occluder is not None) == (changes[0] == INDIRECT[0])
 
 
@@ -156,10 +157,10 @@ def test_sh_diffuse_leaves_an_albedo_that_relights(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", "diffuse=sh", "surfels.metallic=0.1", total=100)
     made.run()
     reflectance = torch.tensor([0.9, 0.6, 0.3])
-    sent = 0.3 * (0.5 + harmonics.DC * made.state.parameters["sh_dc"])  # darken, or most albedos would exceed 1
+    sent = 0.3 * (0.5 + harmonics.DC * made.state.learned["sh_dc"])  # darken, or most albedos would exceed 1
     put(made, metallic=20, albedo=reflectance.logit(), sh_dc=(sent - 0.5) / harmonics.DC)
     with torch.no_grad():
-        made.state.parameters["metallic"][::2] = -20
+        made.state.learned["metallic"][::2] = -20
     write_asset(made.state)
     run = open_run(tmp_path / "run")
     received = run.environment.diffuse(run.surfels().normals())

@@ -37,7 +37,7 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
         float(trainer.iterate()["loss"])  # waits for a card
         marks.append(plan.spent)
     pace = (marks[-1] - marks[WARM - 1]) / (REHEARSED - WARM) / trainer.state.stages[0].cost  # on full photos
-    views, first = len(capture.train_views) + len(capture.test_views), len(trainer.state.parameters["position"])
+    views, first = len(capture.train_views) + len(capture.test_views), trainer.state.learned.count
     pixels, size = _pixels(capture, quick), object_size(trainer.state)
 
     def iterations(settings: Settings) -> float:

@@ -35,7 +35,7 @@ def continue_with_hints(state: State, run: Path, hints: list[Hint]) -> None:
     Raises InputError if the run has no checkpoint, or if it was told not to learn metals.
     """
     snapshot.restore(state, run)
-    if "metallic" not in state.parameters and not needs.bring_back_specular(state, "hints say what is metal"):
+    if "metallic" not in state.learned and not needs.bring_back_specular(state, "hints say what is metal"):
         raise InputError(f"{run} was trained with settings that leave out metals: train it without them first")
     settings = state.settings
     kinds = hinted_kinds(state, read_splats(run / "splats.ply").positions, hints)
@@ -58,7 +58,7 @@ def hinted_kinds(state: State, splats: np.ndarray, hints: list[Hint]) -> torch.T
     tree, kinds = cKDTree(splats), np.full(len(splats), -1)
     for hint in hints:
         kinds[tree.query(hint.points)[1]] = KINDS.index(hint.kind)
-    nearest = tree.query(state.parameters["position"].numpy(force=True))[1]
+    nearest = tree.query(state.learned["position"].numpy(force=True))[1]
     return torch.from_numpy(kinds[nearest]).to(state.device)
 
 
@@ -83,7 +83,7 @@ def _go_back(state: State) -> None:
 def _restart(state: State, names: tuple[str, ...], which: torch.Tensor, settings: Settings) -> None:
     """Give some surfels, those that are true in `which` (N,), the values of parameters with which surfels start by these settings."""
     start = start_appearance(settings)
-    for name in {*names} & state.parameters.keys():
-        value, row = state.parameters[name], start[name][0]
+    for name in {*names} & state.learned.keys():
+        value, row = state.learned[name], start[name][0]
         value[which] = (row[: value.shape[1]] if row.ndim == 2 else row).to(value)  # degrees may be left out
-        state.forget_moments(name, which)
+        state.learned.forget(name, which)

@@ -140,7 +140,7 @@ def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: b
             if state.device.type == "cuda":
                 torch.cuda.synchronize()
             fastest[which] = min(fastest[which], time.perf_counter() - begun)
-            state.forget_gradients()
+            state.learned.forget_gradients()
     return max(fastest[0] - fastest[1], 0.0) * max(state.cost(state.iteration, state.total), 0.0)
 
 

@@ -9,14 +9,13 @@ import torch
 
 from refgs.capture import Capture
 from refgs.events import Report
-from refgs.model.adam import Adam
+from refgs.model.learned import Learned
 from refgs.model.surfels import Parameters, activate
 from refgs.train.decide import needs
 from refgs.train.decide.light_frame import light_frame
 from refgs.train.decide.object_size import limit_surfels, object_size
 from refgs.train.effective import Effective
 from refgs.train.learn import coarse, light, poses, priors
-from refgs.train.learn.guard import limits
 from refgs.train.photo import Photo
 from refgs.train.plan import Plan
 from refgs.train.start import start_appearance, start_parameters
@@ -35,9 +34,8 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     if state.from_hull and state.method.lit and state.settings.light.frame == "world":
         with state.clock.part("start"):
             start, on_hull, source = start_parameters(capture, state.views, state.settings, hollows=True)
-    state.parameters = {name: value.detach().to(state.device).requires_grad_() for name, value in start.items()}
     report("stage", {"what": source})
-    _start_learning(state)
+    _start_learning(state, start)
     poses.start(state)
     needs.evaluate_due(state, "start")
     size = object_size(state)
@@ -67,32 +65,29 @@ def _choose_light_frame(state: State, start: Parameters, on_hull: int) -> None:
         state.announce("light", f"the light {where}: {why}")
 
 
-def _start_learning(state: State) -> None:
-    """Make the initial light and exposures, and an optimiser for them and the surfels.
+def _start_learning(state: State, start: Parameters) -> None:
+    """Start learning the surfels, the light and the photos' exposures.
 
-    Parameters that do not affect this run's pictures are excluded.
+    Surfels start with the parameters `start`. Those that do not affect this run's pictures, and those that the rendering method fixes, are
+    constant.
     """
     settings, method = state.settings, state.method
+    state.learned = Learned(state.capture.radius, method.light.brightest)
+    for name, value in start.items():
+        state.learned.learn(name, value.to(state.device))
     texels = torch.empty(6 * light.resolution(settings, 0) ** 2, 3, device=state.device)
-    state.light = texels.fill_(light.start_value(state)).requires_grad_()
-    _stop_learning_unused(state)
-    learned = dict(state.parameters)
-    if method.lit:
-        learned["environment"] = state.light
-        if settings.light.exposure != "off":
-            exposures = torch.zeros(len(state.views), len(EXPOSURE), device=state.device)
-            learned["exposure"] = state.exposures = exposures.requires_grad_()
-    radius, brightest = state.capture.radius, method.light.brightest
-    groups = [{"params": [value], "name": name} for name, value in learned.items()]
-    state.optimizer = Adam([group | {"limits": limits(group["name"], radius, brightest)} for group in groups])
+    state.learned.learn("environment", texels.fill_(light.start_value(state)), by_row=False)
+    if method.lit and settings.light.exposure != "off":
+        exposures = torch.zeros(len(state.views), len(EXPOSURE), device=state.device)
+        state.learned.learn("exposure", exposures, by_row=False)
+    state.learned.drop(*_unused(state), *method.constants)
+    for name, value in method.constants.items():
+        state.learned.constant[name].fill_(value)
     state.reset_motion()
 
 
-def _stop_learning_unused(state: State) -> None:
-    """Exclude parameters from training if they do not affect this run's pictures, or if the rendering method fixes their values.
-
-    They move from `state.parameters`, with a row for each surfel, to `state.constant`, with one row for all surfels.
-    """
+def _unused(state: State) -> list[str]:
+    """Return the names of the surfels' parameters that do not affect this run's pictures."""
     method, diffuse = state.method, state.settings.render.diffuse
     unused = [*method.unread]
     if method.lit and diffuse == "irradiance":
@@ -103,9 +98,7 @@ def _stop_learning_unused(state: State) -> None:
             state.announce("reflections", f"without inter-reflection: {why}")
     if why or diffuse == "sh":
         unused += ["received"]
-    state.constant = {name: state.parameters.pop(name).detach()[:1] for name in [*unused, *method.constants]}
-    for name, value in method.constants.items():
-        state.constant[name].fill_(value)
+    return unused
 
 
 @torch.no_grad()
@@ -116,12 +109,9 @@ def start_deferred(state: State) -> None:
     """
     state.initial = False
     for name, row in start_appearance(state.settings).items():
-        if name in state.parameters:
-            state.parameters[name][:] = row
-            state.optimizer.state.pop(state.parameters[name], None)
-    state.light.fill_(light.start_value(state))
-    state.optimizer.state.pop(state.light, None)
-    if state.exposures is not None:  # learned against the light before
-        state.exposures.zero_()
-        state.optimizer.state.pop(state.exposures, None)
+        if name in state.learned:
+            state.learned.fill(name, row)
+    state.learned.fill("environment", light.start_value(state))
+    if "exposure" in state.learned:  # learned against the light before
+        state.learned.fill("exposure", 0.0)
     state.report("stage", {"what": "shading what is blended: colour, material and light start anew"})

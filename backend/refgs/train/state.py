@@ -13,9 +13,9 @@ from refgs.capture import Capture, load_views
 from refgs.clock import Clock
 from refgs.events import Report
 from refgs.geometry.visibility import Occluder
-from refgs.model.adam import Adam
 from refgs.model.environment import Environment
-from refgs.model.surfels import Parameters, Surfels, activate
+from refgs.model.learned import Learned
+from refgs.model.surfels import Surfels, activate
 from refgs.render.baselines import Method, initial_stage, method_of
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.run_folder import PHOTOS
@@ -98,16 +98,12 @@ class State:
         self.needs: dict[str, dict[str, Any]] = {}  # the decisions of `train/needs`, by the need's name
         self.initial = self.method.deferred and self.settings.initial.until > 0  # its stage is not over
         self.metals_set = False  # whether `metals.set_metals_due` has set them
-        self.parameters: Parameters = {}  # one row a surfel
-        self.constant: Parameters = {}  # parameters that do not learn: one row for all surfels
-        self.light = torch.empty(0, 3)  # raw texels; `environment` makes radiance of them
+        self.learned = Learned()  # surfels, "environment" (raw texels of the light), and "exposure" (one row a view)
         self.light_shown: Tensor | None = None  # the weight of each texel in the light's mean
-        self.exposures: Tensor | None = None  # one row a view; None: photos have no exposures of their own (`exposure`)
         self.exposure_basis = torch.tensor(EXPOSURE, device=self.device)
         self.given: list[Camera] = []  # the views' cameras in the capture
         self.poses: Tensor | None = None  # (views, 6), see `train/poses.py`; None: cameras are the capture's own
         self.poses_judged = False  # whether `poses.put_back_if_worse` has
-        self.optimizer = Adam([])
         self.motion = ScreenGradient(0, self.device)
         self.occluder: Occluder | None = None
 
@@ -145,8 +141,8 @@ class State:
 
     def surfels(self) -> Surfels:
         """Compute the surfels from their raw parameters. A parameter that does not learn has one value for all surfels."""
-        count, late = len(self.parameters["position"]), self.residual_start
-        values = activate({**self.parameters, **self.constant})
+        count, late = self.learned.count, self.residual_start
+        values = activate(self.learned.by_row | self.learned.constant)
         unlearned = late == 1 or self.iteration < late * self.total
         if self.method.lit and self.settings.render.diffuse == "irradiance" and unlearned:
             values = values.without_directions()
@@ -157,7 +153,7 @@ class State:
         if not self.method.lit:
             return None
         reference = self.views[0].camera if self.settings.light.frame == "camera" else None
-        return Environment(self.method.light.radiance(self.light), reference)
+        return Environment(self.method.light.radiance(self.learned["environment"]), reference)
 
     def inputs(self) -> RenderInputs:
         """Gather the inputs of a rendering: the surfels, the light, the render settings and the mesh for inter-reflection."""
@@ -202,12 +198,11 @@ class State:
     def exposure(self, view: int | slice) -> Tensor | None:
         """Compute a view's exposure (3,): factors of its rendered red, green and blue. Return None if exposures are not learned.
 
-        `exposures` are the weights of the rows of EXPOSURE in the factors' natural logarithms. If they have only one column, the photos
+        What is learned are the weights of the rows of EXPOSURE in the factors' natural logarithms. If it has only one column, the photos
         have the same white balance, and a view's three factors are equal. A slice of views gives the exposures of all of them (V, 3).
         """
-        if self.exposures is None:
-            return None
-        return (self.exposures[view] @ self.exposure_basis[: self.exposures.shape[1]]).exp()
+        weights = self.learned.get("exposure")
+        return None if weights is None else (weights[view] @ self.exposure_basis[: weights.shape[1]]).exp()
 
     def spread_cameras(self, least: int) -> list[Camera]:
         """Return the cameras of at least `least` training views, evenly spaced. If there are fewer views, return all cameras."""
@@ -218,7 +213,7 @@ class State:
 
         Surfels outside the region only exist to reproduce the background of the photos.
         """
-        position, box = self.parameters["position"], self.capture.box
+        position, box = self.learned["position"], self.capture.box
         if box is None:
             return torch.ones(len(position), dtype=torch.bool, device=self.device)
         return torch.from_numpy(box.contains(position.numpy(force=True))).to(self.device)
@@ -236,56 +231,9 @@ class State:
         """
         self.effective = self.effective.changed(key, value, by, why)
 
-    def group(self, name: str) -> dict[str, Any]:
-        """Return the optimiser's parameter group of this name."""
-        return next(group for group in self.optimizer.param_groups if group["name"] == name)
-
-    def leave_out(self, *names: str) -> None:
-        """Stop learning the parameters with these `names`. From then on, all surfels have the values of the first surfel."""
-        for name in names:
-            if name in self.parameters:
-                value = self.parameters.pop(name)
-                self.optimizer.state.pop(value, None)
-                self.constant[name] = value.detach()[:1].clone()
-        self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] not in names]
-
-    def shorten(self, name: str, count: int) -> None:
-        """Keep only the first `count` spherical harmonic coefficients of the parameter `name`. Adam's moments are shortened, too."""
-        self.parameters[name] = self._first_columns(name, self.parameters[name], count)
-
-    def _first_columns(self, name: str, old: Tensor, count: int) -> Tensor:
-        """Return the first `count` columns of a learned tensor, and let the optimiser's group `name` learn these in place of `old`."""
-        new, state = old.detach()[:, :count].contiguous().requires_grad_(), self.optimizer.state.pop(old, {})
-        self.group(name)["params"][0] = new
-        if state:
-            moments = {key: state[key][:, :count].contiguous() for key in ("exp_avg", "exp_avg_sq")}
-            self.optimizer.state[new] = state | moments
-        return new
-
-    def without_white_balance(self) -> None:
-        """Stop learning a white balance for each photo. Its exposure is one factor from then on."""
-        self.exposures = self._first_columns("exposure", self.exposures, 1)
-
-    def without_exposures(self) -> None:
-        """Stop learning exposures. Each photo's exposure is then one."""
-        self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] != "exposure"]
-        self.optimizer.state.pop(self.exposures, None)
-        self.exposures = None
-
     def reset_motion(self) -> None:
         """Restart the mean of the screen gradients, which says which surfels to divide. Call this after surfels have been replaced."""
-        self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
-
-    def forget_moments(self, name: str, which: Tensor) -> None:
-        """Set Adam's moments of a parameter to zero for some surfels, those that are true in `which` (N,), whose values were set."""
-        moments = self.optimizer.state.get(self.parameters[name], {})
-        for key in ("exp_avg", "exp_avg_sq") if moments else ():
-            moments[key][which] = 0
-
-    def forget_gradients(self) -> None:
-        """Drop the last backward pass's gradients."""
-        for group in self.optimizer.param_groups:
-            group["params"][0].grad = None
+        self.motion = ScreenGradient(self.learned.count, self.device)
 
 
 def why_not_traced(state: State) -> str:

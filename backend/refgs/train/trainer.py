@@ -65,20 +65,20 @@ class Trainer:
         rendering = state.picture(inputs, photo.camera, state.exposure(view))
         mean = light.mean_radiance(state, inputs.environment)
         loss, square = objective(rendering, mean, photo, state.background, state.losses, progress)
-        if state.exposures is not None:
-            loss = loss + state.settings.loss.exposure * departure(state.exposures[view])
+        if "exposure" in state.learned:
+            loss = loss + state.settings.loss.exposure * departure(state.learned["exposure"][view])
         if (leaning := priors.loss(state, view, rendering, photo, progress)) is not None:
             loss = loss + leaning
         loss.backward()
         metals.hold(state)
-        accepted, position = self.guard.judge(loss, state.optimizer), state.parameters["position"]
+        accepted, position = self.guard.judge(loss, state.learned), state.learned["position"]
         state.motion.add(position.detach(), position.grad, state.photos[view].camera, accepted)
-        state.optimizer.step(accepted)
+        state.learned.step(accepted)
         poses.refine_due(state, view, rendering, photo, progress)
         if inputs.environment is not None:
             light.diffuse(state)
         exposures.balance(state)
-        state.forget_gradients()
+        state.learned.forget_gradients()
         state.iteration += 1
 
         trace_due(state, progress)  # meshes and decisions come before an opacity reset makes all surfels faint
@@ -111,7 +111,7 @@ class Trainer:
         """
         state, means = self.state, {}
         before, first = state.seconds, state.iteration
-        more = growth(len(state.parameters["position"]), state.settings.surfels.budget)
+        more = growth(state.learned.count, state.settings.surfels.budget)
         state.plan.begin(state.iteration, more, state.stages)
         while not state.ended and not self._should_stop(stop):
             figures = self.iterate()
@@ -136,7 +136,7 @@ class Trainer:
         state = self.state
         facts = {"iteration": state.iteration, "total": state.total, "seconds": state.seconds}
         facts |= {"seconds_left": pace * state.cost(state.iteration, state.total), "loss": float(means["loss"])}
-        facts |= {"psnr": decibels(float(means["square"])), "splats": len(state.parameters["position"])}
+        facts |= {"psnr": decibels(float(means["square"])), "splats": state.learned.count}
         state.report("progress", facts)
 
     def _record(self, means: dict[str, Tensor]) -> None:

@@ -60,7 +60,7 @@ class Reflections(Need):
 
     def apply(self, state: State, found: dict[str, Any]) -> None:
         state.occluder = None
-        state.leave_out(*INDIRECT)
+        state.learned.drop(*INDIRECT)
 
 
 def share_hidden(hidden: float) -> str:
@@ -154,9 +154,9 @@ class Degrees(Need):
         figures, why, counts = {"seconds": 0.0, "megabytes": 0.0, "decibels": 0.0}, [], {}
         inputs = state.inputs()
         for field, name in (("sh_rest", "what is left over"), ("indirect_rest", "inter-reflection")):
-            if field not in state.parameters:
+            if field not in state.learned:
                 continue
-            whole = state.parameters[field].shape[1]
+            whole = state.learned[field].shape[1]
             count, loss, shorter = whole, 0.0, inputs
             for degree in reversed(range(math.isqrt(whole + 1) - 1)):
                 fewer = _shortened(inputs, field, (degree + 1) ** 2 - 1)
@@ -168,14 +168,14 @@ class Degrees(Need):
                 continue
             inputs, counts[field] = shorter, count
             figures["seconds"] += probe.seconds_saved(state, lambda i, f=field, c=count: _shortened(i, f, c))
-            numbers = len(state.parameters["position"]) * 3 * (whole - count)
+            numbers = state.learned.count * 3 * (whole - count)
             figures["megabytes"] += numbers * NUMBER / MEGA
             figures["decibels"] += loss
             why.append(f"of {name} degree {last} is the last that is worth {self.threshold} dB")
 
         def shorten() -> None:
             for field, count in counts.items():
-                state.shorten(field, count)
+                state.learned.columns(field, count)
 
         why = "; ".join(why) or "the last degree is worth more"
         return Decision(not counts, why, {"threshold": self.threshold, **figures}, once=shorten)

@@ -8,15 +8,14 @@ from torch import Tensor
 from refgs.model.surfels import Surfels
 from refgs.train import probe
 from refgs.train.decide.need import ASKED, MEGA, Decision, Moment, Need, megabytes
-from refgs.train.learn.guard import limits
 from refgs.train.material import changes
 from refgs.train.start import start_appearance
 from refgs.train.state import RenderInputs, State, why_not_traced
+from refgs.train.timeline import SOONEST
 
 KNOWN = 0.05  # part of the training after which it is known what mirrors: materials learn faster than shapes
 CHANGES = 0.042  # of 1; matte clay has 0.037, an embossed gold cape in flat light 0.056, a mirror 0.2
 SMALL_PART = 1.0  # dB of a small part (`probe.PART`); matte clay has -1.2, a clay pig with a chrome bell 1.7
-SOONEST = 100  # iterations: a mirror that has learned for fewer looks dull
 RARE = 1e-3  # part of the pictures, at either end, whose surfels do not count for a common value
 INDIRECT = "indirect_dc", "indirect_rest", "received"
 
@@ -63,7 +62,7 @@ class Specular(Need):
     def apply(self, state: State, found: dict[str, Any]) -> None:
         state.change("render.reflection", "none", "needs", found["why"])
         state.occluder = None
-        state.leave_out("metallic", "roughness", *INDIRECT)
+        state.learned.drop("metallic", "roughness", *INDIRECT)
 
     def undo(self, state: State, why: str) -> None:
         state.change("render.reflection", state.effective.asked.render.reflection, "needs", why)
@@ -85,13 +84,10 @@ class Specular(Need):
 
 def _learn_again(state: State, names: list[str]) -> None:
     """Learn parameters that were left out. All surfels start with the settings' values."""
-    start, count = start_appearance(state.effective.asked), len(state.parameters["position"])
+    start, count = start_appearance(state.effective.asked), state.learned.count
     for name in names:
-        del state.constant[name]
         row = start[name].to(state.device)
-        value = state.parameters[name] = row.expand(count, *row.shape[1:]).clone().requires_grad_()
-        within = limits(name, state.capture.radius, state.method.light.brightest)
-        state.optimizer.param_groups.append({"params": [value], "name": name, "lr": 0.0, "limits": within})
+        state.learned.learn(name, row.expand(count, *row.shape[1:]).clone())
 
 
 class Constants(Need):

@@ -79,4 +79,4 @@ class Need:
 
 def megabytes(state: State, names: tuple[str, ...]) -> float:
     """Compute how much memory training these parameters takes, in MB: their values, gradients and Adam's moments."""
-    return sum(state.parameters[name].numel() for name in names if name in state.parameters) * NUMBER / MEGA
+    return sum(state.learned[name].numel() for name in names if name in state.learned) * NUMBER / MEGA

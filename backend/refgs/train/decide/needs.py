@@ -15,8 +15,8 @@ from refgs.train.decide.materials import Constants, Specular
 from refgs.train.decide.need import Decision, Moment, Need
 from refgs.train.decide.photos import WHOLE_EVERY, Outside, Views, time_crops
 from refgs.train.decide.pictures import write_pictures
-from refgs.train.learn.densify import faint_now
 from refgs.train.state import State
+from refgs.train.timeline import decidable
 
 CONSTANTS, SPECULAR = Constants(), Specular()
 NEEDS: tuple[Need, ...] = (
@@ -40,7 +40,6 @@ __all__ = [
     "NEEDS",
     "WHOLE_EVERY",
     "bring_back_specular",
-    "decidable",
     "evaluate_due",
     "evaluate_iteration",
     "evaluate_mesh",
@@ -72,15 +71,6 @@ def evaluate_iteration(state: State, progress: float) -> None:
         time_crops(state)
         _look_again(state)
         evaluate_due(state, "iteration", progress=progress)
-
-
-def decidable(state: State) -> bool:
-    """Tell whether surfels, materials and light can be judged now.
-
-    They cannot in the initial stage, while surfels are faint after an opacity reset, and in a method without materials of pixels.
-    """
-    by_pixels = state.method.deferred and state.settings.render.diffuse == "irradiance"
-    return by_pixels and not state.initial and not faint_now(state)
 
 
 def _look_again(state: State) -> None:

@@ -68,9 +68,10 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
         update_metrics(folder, {"doubt": facts})
     splats.normals *= side[kept].numpy(force=True)[:, None]
     splats.normals = blended_normals(splats)
-    if state.exposures is not None or state.poses is not None:
+    exposed = "exposure" in state.learned
+    if exposed or state.poses is not None:
         exposures = None
-        if state.exposures is not None:
+        if exposed:
             factors = state.exposure(slice(None)).tolist()
             exposures = {view.camera.name: factor for view, factor in zip(state.views, factors, strict=True)}
         write_cameras(
@@ -163,9 +164,9 @@ def _needs_rows(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) ->
     if method.deferred and state.occluder is None and "reflections" not in state.needs:
         why = why_not_traced(state) or _why_no_mesh(state)
         add("inter-reflection", why, "tracing rays, and harmonics of light from the object")
-    if settings.light.exposure == "auto" and method.lit and state.exposures is None:
+    if settings.light.exposure == "auto" and method.lit and "exposure" not in state.learned:
         add("exposures", "those of the photos agree within a third of a stop", "three numbers a photo")
-    if state.exposures is not None and state.exposures.shape[1] == 1:
+    if "exposure" in state.learned and state.learned["exposure"].shape[1] == 1:
         add("white balances", "those of the photos agree within a tenth", "two numbers a photo")
     if any(view.alpha is None for view in state.views):
         add("the mask loss", "not every photo has a mask", "one term of the loss")

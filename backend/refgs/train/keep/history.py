@@ -56,7 +56,7 @@ def record(state: State, measures: Measures, loss: float, quality: float) -> Non
         "seconds": round(state.seconds, 3),
         "loss": loss,
         "psnr_train": quality,
-        "splats": len(state.parameters["position"]),
+        "splats": state.learned.count,
     }
     for part, measure in (("measuring", measures.errors), ("FLIP", measures.flip)):
         if parts.get(part, 0.0) <= limit:

@@ -18,15 +18,8 @@ from refgs.train.state import State, why_not_traced
 
 def save(state: State) -> None:
     """Write a checkpoint into the run folder."""
-    tensors = {f"parameter.{name}": value for name, value in state.parameters.items()}
-    tensors |= {f"constant.{name}": value for name, value in state.constant.items()}
-    tensors |= {
-        "environment": state.light,
-        "motion.total": state.motion.total,
-        "motion.views": state.motion.views,
-    }
-    if state.exposures is not None:
-        tensors |= {"exposure": state.exposures}
+    tensors = state.learned.save()
+    tensors |= {"motion.total": state.motion.total, "motion.views": state.motion.views}
     if state.poses is not None:
         tensors |= {"poses": state.poses}
     if state.light_shown is not None:
@@ -35,9 +28,6 @@ def save(state: State) -> None:
         mesh = state.occluder.mesh
         tensors |= {"occluder.vertices": torch.from_numpy(mesh.vertices)}
         tensors |= {"occluder.faces": torch.from_numpy(mesh.faces.astype(np.int32))}
-    for group in state.optimizer.param_groups:
-        moments = state.optimizer.state.get(group["params"][0], {})
-        tensors |= {f"adam.{group['name']}.{key}": torch.as_tensor(value) for key, value in moments.items()}
     facts = {"seconds": state.seconds, "total": state.total, "initial": state.initial, "decided": state.decided}
     facts |= {"parts": state.clock.seconds, "spent": state.plan.spent}
     facts |= {"processor_seconds": state.processor_seconds, "needs": state.needs, "metals_set": state.metals_set}
@@ -55,19 +45,12 @@ def restore(state: State, run: Path) -> None:
     _check_tensors(tensors, run)
     state.total = facts.total
     needs.restore(state, {name: found.model_dump(exclude_unset=True) for name, found in facts.needs.items()})
-    for name in state.constant:  # left out after this checkpoint, where the training goes back to it
-        if f"parameter.{name}" in tensors:
-            tensors[f"constant.{name}"] = tensors[f"parameter.{name}"][:1]
-    count = len(tensors["parameter.position"])
-    for name in state.parameters:  # left out at this checkpoint, and learned again after it
-        if f"parameter.{name}" not in tensors and f"constant.{name}" in tensors:
-            row = tensors[f"constant.{name}"]
-            tensors[f"parameter.{name}"] = row.expand(count, *row.shape[1:]).clone()
-    needed = {f"parameter.{name}" for name in state.parameters} | {f"constant.{name}" for name in state.constant}
-    if not needed <= tensors.keys():
-        raise InputError(f"{run} was begun by another release of RefGS: train again into a new folder")
     mesh = {name: tensors.pop(name).numpy() for name in list(tensors) if name.startswith("occluder.")}
     tensors = {name: value.to(state.device) for name, value in tensors.items()}
+    try:
+        state.learned.load(tensors)
+    except KeyError:
+        raise InputError(f"{run} was begun by another release of RefGS: train again into a new folder") from None
     state.iteration, state.seconds = facts.iteration, facts.seconds
     state.clock.resume(facts.parts)
     state.plan.before = state.seconds if facts.spent is None else facts.spent
@@ -77,28 +60,9 @@ def restore(state: State, run: Path) -> None:
     for about, what in facts.decided.items():
         state.announce(about, what)
     state.motion.total, state.motion.views = tensors["motion.total"], tensors["motion.views"]
-    state.optimizer.state.clear()
-    if "exposure" not in tensors:
-        state.without_exposures()
-    for group in state.optimizer.param_groups:
-        name = group["name"]
-        value = tensors[name if name in ("environment", "exposure") else f"parameter.{name}"]
-        value.requires_grad_()
-        group["params"][0] = value
-        if name == "environment":
-            state.light = value
-        elif name == "exposure":
-            state.exposures = value
-        else:
-            state.parameters[name] = value
-        prefix = f"adam.{name}."
-        moments = {key.removeprefix(prefix): t for key, t in tensors.items() if key.startswith(prefix)}
-        if moments:
-            state.optimizer.state[value] = moments | {"step": int(moments["step"])}
     state.light_shown = tensors.get("mirrored")
     poses.restore(state, tensors["poses"].cpu() if "poses" in tensors else None)
     coarse.set_factor(state, facts.reduced)
-    state.constant = {name: tensors[f"constant.{name}"] for name in state.constant}
     state.occluder = None
     if mesh and not why_not_traced(state):
         state.occluder = Occluder(Mesh(mesh["occluder.vertices"], mesh["occluder.faces"]))

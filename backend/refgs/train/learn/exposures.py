@@ -4,8 +4,8 @@ import math
 
 import torch
 
-from refgs.train.learn.densify import faint_now
 from refgs.train.state import State
+from refgs.train.timeline import faint_now
 
 KNOWN = 0.3  # part of the training after which exposures are known well enough to judge
 # A third of a stop, the step of a camera's dial: smaller differences may be errors of the shading.
@@ -16,15 +16,16 @@ BALANCED = 0.1  # largest difference of a channel's logarithm that may be an err
 @torch.no_grad()
 def balance(state: State) -> None:
     """Make the photos' white balances neutral in the mean. Without this, a coloured light in all photos could not be told from theirs."""
-    if state.exposures is not None and state.exposures.shape[1] > 1:
-        state.exposures[:, 1:] -= state.exposures[:, 1:].mean(dim=0)
+    weights = state.learned.get("exposure")
+    if weights is not None and weights.shape[1] > 1:
+        weights[:, 1:] -= weights[:, 1:].mean(dim=0)
 
 
 @torch.no_grad()
 def leave_out_alike(state: State, progress: float) -> None:
     """Stop learning exposures, or only white balances, if the learned ones are nearly equal and `light.exposure` is "auto"."""
     settings = state.settings
-    if state.exposures is None or settings.light.exposure != "auto" or state.initial:
+    if "exposure" not in state.learned or settings.light.exposure != "auto" or state.initial:
         return
     if state.iteration % settings.densify.every or progress < KNOWN or faint_now(state):
         return
@@ -36,8 +37,8 @@ def leave_out_alike(state: State, progress: float) -> None:
     if tint >= BALANCED:
         return
     if brightness < ALIKE:
-        state.without_exposures()
+        state.learned.drop("exposure")
         state.announce("exposures", "the photos have no exposures of their own: they agree within a third of a stop")
-    elif state.exposures.shape[1] > 1:
-        state.without_white_balance()
+    elif state.learned["exposure"].shape[1] > 1:
+        state.learned.columns("exposure", 1)
         state.announce("exposures", "the photos differ in exposure, but not in white balance")

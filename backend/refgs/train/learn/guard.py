@@ -1,41 +1,14 @@
 """Guard a training against NaN and infinity: skip and count the steps that have them, and remove the surfels that have them."""
 
-import math
-
 import torch
 from torch import Tensor
 
 from refgs.errors import InputError
-from refgs.model.adam import Adam
-from refgs.model.surfels import Parameters
+from refgs.model.learned import Learned
 from refgs.train.keep import checkpoint
-from refgs.train.learn.densify import take
 from refgs.train.state import State
 
 MOST_IN_A_ROW = 30  # steps that may be left out before the training goes back
-LOGIT = 12.0  # beyond, float32 cannot tell a logistic function from its limit, and its slope is of no use
-LIMITS = {
-    "opacity": (-LOGIT, LOGIT),
-    "albedo": (-LOGIT, LOGIT),
-    "roughness": (-LOGIT, LOGIT),
-    "metallic": (-LOGIT / 2, LOGIT / 2),  # activated by a function that nears its limits as the square
-    "exposure": (-LOGIT, LOGIT),  # natural logarithms: 17 stops
-}
-DARKEST = -LOGIT  # raw light: below, softplus' slope, which is the radiance itself, is of no use
-SMALLEST, LARGEST = 1e-6, 1e2  # of a surfel, in scene radii
-
-
-def limits(name: str, radius: float, brightest: float) -> tuple[float, float]:
-    """Return the lowest and the highest raw value, before activation, that the parameter `name` may take.
-
-    Beyond these limits, gradients would be too small to move the parameter back. `radius` is the scene's radius. `brightest` is the highest
-    raw value of the light's texels.
-    """
-    if name == "scale":
-        return math.log(SMALLEST * radius), math.log(LARGEST * radius)
-    if name == "environment":
-        return DARKEST, brightest
-    return LIMITS.get(name, (-math.inf, math.inf))
 
 
 class Guard:
@@ -49,15 +22,12 @@ class Guard:
         self._seen, self._said, self._gone_back, self._taken = 0, 0, -1, -1
 
     @torch.no_grad()
-    def judge(self, loss: Tensor, optimizer: Adam) -> Tensor:
-        """Return 1 if the optimiser may take this step, else 0, as a float32 scalar tensor.
+    def judge(self, loss: Tensor, learned: Learned) -> Tensor:
+        """Return 1 if Adam may take this step, else 0, as a float32 scalar tensor.
 
         The step may be taken if the loss and the sum of all squared gradients are finite. Steps that may not be taken are counted.
         """
-        gradients = [
-            value.grad for group in optimizer.param_groups for value in group["params"] if value.grad is not None
-        ]
-        size = torch.nn.utils.get_total_norm([*gradients, loss.detach()])
+        size = torch.nn.utils.get_total_norm([*learned.gradients(), loss.detach()])
         accepted = size.isfinite().float()
         self._counts[:2] += 1 - accepted
         self._counts[1] *= 1 - accepted
@@ -83,13 +53,12 @@ class Guard:
         if total > 2 * self._said:  # warn each time the count has doubled, not every ten iterations
             self._said = total
             warn(state, f"steps not taken so far, for the loss or a gradient was not finite: {total}")
-        count = remove_broken(state.parameters, state.optimizer)
+        count = remove_broken(state.learned)
         if count:
             state.reset_motion()
             warn(state, f"surfels removed, for they had numbers that are not finite: {count}")
-        groups = state.optimizer.param_groups
-        elsewhere = [group["params"][0] for group in groups if group["name"] not in state.parameters]
-        lit = all(bool(value.isfinite().all()) for value in elsewhere)
+        elsewhere = state.learned.keys() - state.learned.by_row.keys()
+        lit = all(bool(state.learned[name].isfinite().all()) for name in elsewhere)
         if lit and (in_a_row < MOST_IN_A_ROW or count):
             return ""
         kept = checkpoint.complete(state.folder / "checkpoints")
@@ -111,16 +80,16 @@ def warn(state: State, what: str) -> None:
 
 
 @torch.no_grad()
-def remove_broken(parameters: Parameters, optimizer: Adam) -> int:
+def remove_broken(learned: Learned) -> int:
     """Remove surfels that have a number that is not finite. Returns how many. Raises InputError if none would be left."""
-    whole = torch.stack(
-        [value.flatten(1).isfinite().all(dim=1) for value in (v[:, None] for v in parameters.values())]
-    ).all(dim=0)
+    whole = torch.stack([value[:, None].flatten(1).isfinite().all(dim=1) for value in learned.by_row.values()]).all(
+        dim=0
+    )
     count = int((~whole).sum())
     if count == len(whole):
         raise InputError("no surfel is finite any more: train anew with lower rates (--set rates.…)")
     if count:
-        take(parameters, optimizer, whole.nonzero()[:, 0])
+        learned.rows(whole.nonzero()[:, 0])
     return count
 
 

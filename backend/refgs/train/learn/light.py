@@ -48,25 +48,20 @@ def resolution(settings: Settings, progress: float) -> int:
 @torch.no_grad()
 def refine_due(state: State, progress: float) -> None:
     """Double the cubemap's texels along a side, once the training is far enough for it (see `resolution`)."""
-    if not state.method.lit or len(state.light) >= 6 * resolution(state.settings, progress) ** 2:
+    if not state.method.lit or len(state.learned["environment"]) >= 6 * resolution(state.settings, progress) ** 2:
         return
-    side = math.isqrt(len(state.light) // 6)
+    side = math.isqrt(len(state.learned["environment"]) // 6)
     directions = cubemap.texel_directions(2 * side).float()
-    finer = cubemap.sample(state.light.cpu(), (side,), directions, torch.zeros(len(directions)))
-    _replace(state, finer.to(state.device))
+    finer = cubemap.sample(state.learned["environment"].cpu(), (side,), directions, torch.zeros(len(directions)))
+    state.learned.learn("environment", finer.to(state.device), by_row=False)
 
 
 @torch.no_grad()
 def coarsen(state: State, side: int) -> None:
     """Reduce the cubemap to `side` texels along a side by averaging texels."""
-    fine = math.isqrt(len(state.light) // 6) // side
-    _replace(state, state.light.view(6, side, fine, side, fine, 3).mean(dim=(2, 4)).reshape(-1, 3))
-
-
-def _replace(state: State, texels: Tensor) -> None:
-    state.optimizer.state.pop(state.light, None)
-    state.light = texels.requires_grad_()
-    state.group("environment")["params"] = [state.light]
+    fine = math.isqrt(len(state.learned["environment"]) // 6) // side
+    texels = state.learned["environment"].view(6, side, fine, side, fine, 3).mean(dim=(2, 4)).reshape(-1, 3)
+    state.learned.learn("environment", texels, by_row=False)
 
 
 @timed("optimiser")
@@ -78,14 +73,14 @@ def diffuse(state: State) -> None:
     decay (Loshchilov and Hutter 2019). Where the photos agree on a texel, the optimiser moves it faster than this step, and details and
     colours stay. Where only noise moves the texels, they become alike and grey. The mean over all texels and channels does not change.
     """
-    side = math.isqrt(len(state.light) // 6)
-    rate, settings = state.group("environment")["lr"], state.settings.environment
+    side = math.isqrt(len(state.learned["environment"]) // 6)
+    rate, settings = state.learned.rates["environment"], state.settings.environment
     if grey := min(rate * settings.grey, 1.0):
-        state.light.lerp_(state.light.mean(dim=1, keepdim=True), grey)
+        state.learned["environment"].lerp_(state.learned["environment"].mean(dim=1, keepdim=True), grey)
     part = min(rate * settings.diffusion * (side / DIFFUSED) ** 2, 0.25)
     if part == 0:
         return
-    texels = state.light.view(6, side, side, 3)
+    texels = state.learned["environment"].view(6, side, side, 3)
     for axis in (1, 2):
         flow = part * texels.diff(dim=axis)
         texels.narrow(axis, 0, side - 1).add_(flow)

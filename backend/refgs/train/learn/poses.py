@@ -90,7 +90,7 @@ def put_back_if_worse(state: State, progress: float) -> None:
 @torch.no_grad()
 def shifts(state: State) -> np.ndarray:
     """Measure by how many pixels the refined poses move the surfels in each photo: the root mean square over some surfels, (V,)."""
-    positions = state.parameters["position"].double().numpy(force=True)
+    positions = state.learned["position"].double().numpy(force=True)
     points = positions[:: max(1, len(positions) // SAMPLE)]
     points = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     found = []

@@ -1,25 +1,25 @@
 """Set the learning rates of an iteration: decay them, and freeze some parameters in some stages of the training."""
 
-from refgs.train.learn.densify import since_propagation
 from refgs.train.start import GEOMETRY
 from refgs.train.state import State
+from refgs.train.timeline import since_propagation
 
 REFLECTING = ("albedo", "metallic", "roughness", "indirect_dc", "indirect_rest", "environment", "exposure")
 
 
 def set_rates(state: State, progress: float) -> None:
-    """Set the learning rate of each parameter group of the optimiser, at a progress of 0..1."""
+    """Set the learning rate of each tensor, at a progress of 0..1."""
     rates, late = state.settings.rates, state.residual_start
     frozen = _frozen(state, progress)
-    for group in state.optimizer.param_groups:
-        name, decay = group["name"], rates.decay**progress
+    for name in state.learned:
+        decay = rates.decay**progress
         if name == "position":
             decay = rates.position_decay ** min(progress / rates.position_until, 1)
         elif name in REFLECTING:
             decay = rates.decay ** min(progress / late, 1)
         elif name == "sh_rest" and late < 1:
             decay = rates.decay ** (max(progress - late, 0) / (1 - late))
-        group["lr"] = 0.0 if name in frozen else _start_rate(state, name) * decay
+        state.learned.rates[name] = 0.0 if name in frozen else _start_rate(state, name) * decay
 
 
 def _start_rate(state: State, name: str) -> float:

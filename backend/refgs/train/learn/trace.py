@@ -12,8 +12,8 @@ from refgs.render.extract import extract
 from refgs.render.relight import received
 from refgs.render.volume import with_normals_last
 from refgs.train.decide import needs
-from refgs.train.learn.densify import faint_now
 from refgs.train.state import State, why_not_traced
+from refgs.train.timeline import faint_now
 
 VIEWS = 24  # at least, that the mesh is fused from; all where there are fewer
 
@@ -55,14 +55,14 @@ def _trace(state: State) -> None:
         opaque = seen.alpha > 0.5
         hidden += float((1 - seen.visibility)[opaque].sum())
         solid += float(opaque.sum())
-    if not state.optimizer.state.get(state.parameters["indirect_dc"]):
+    if "indirect_dc" not in state.learned.moments:
         # Start from the light that the surfels mirrored until now, so that the picture changes little.
-        start, rest = environment.harmonics, state.parameters["indirect_rest"]
-        state.parameters["indirect_dc"][:], rest[:] = start[:1], start[1 : 1 + rest.shape[1]]
+        start, rest = environment.harmonics, state.learned["indirect_rest"]
+        state.learned["indirect_dc"][:], rest[:] = start[:1], start[1 : 1 + rest.shape[1]]
     with state.clock.part("deciding"):
         needs.evaluate_mesh(state, hidden / solid)
-    if state.occluder is not None and "received" in state.parameters:
+    if state.occluder is not None and "received" in state.learned:
         # Traced anew with each mesh, for light and mesh are better known by then.
         traced = Surfels(*(value.cpu() for value in with_normals_last(surfels)))
         light = Environment(environment.radiance.cpu())  # in the world's frame: in the camera's nothing is traced
-        state.parameters["received"][:] = received(traced, state.occluder, light)
+        state.learned["received"][:] = received(traced, state.occluder, light)

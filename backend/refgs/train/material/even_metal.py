@@ -38,7 +38,7 @@ def even_out_due(state: State, progress: float) -> None:
     near = neighbours(surfels.positions, AVERAGED, metal)
     weight = (surfels.opacities * metal).view(-1, 1)
     total = pooled(weight, near).clamp_min(1e-6)
-    for name in {"albedo", "roughness"} & state.parameters.keys():
-        values = state.parameters[name]
+    for name in {"albedo", "roughness"} & state.learned.keys():
+        values = state.learned[name]
         mean = pooled(weight * values.view(len(weight), -1), near) / total
         values[metal] = mean.view_as(values[metal])

@@ -10,12 +10,11 @@ again, since roughness, light and base colour explain rough metal and paint abou
 import torch
 
 from refgs.model.surfels import raw_metallic
-from refgs.train.decide import needs
-from refgs.train.decide.materials import SOONEST
 from refgs.train.material import mirrored, same_material
 from refgs.train.material.changes import falls_as_metal, observe, shines_as_metal
 from refgs.train.material.changing_light import explained
 from refgs.train.state import State
+from refgs.train.timeline import SOONEST, decidable
 
 KNOWN = 0.1  # part of the training after which surfels lie near enough to the surface
 METAL, PAINT = 0.9, 0.02  # metallic; training can still change it
@@ -47,8 +46,8 @@ def set_metals_due(state: State, progress: float) -> None:
     early = progress - state.settings.initial.until < KNOWN or state.iteration < SOONEST
     if state.metals_set or early or progress >= state.residual_start or not _decidable(state):
         return
-    observations, metallic = observe(state), state.parameters["metallic"]
-    positions, weight = state.parameters["position"].detach(), observations.pixels.sum(dim=1) * state.wanted()
+    observations, metallic = observe(state), state.learned["metallic"]
+    positions, weight = state.learned["position"].detach(), observations.pixels.sum(dim=1) * state.wanted()
     coloured, faint, tells = shines_as_metal(observations, positions)
     metal = coloured | falls_as_metal(observations, positions, float(state.environment().radiance.detach().mean()))
     told, shown, shown_faintly = explained(observations, positions, state.capture.radius, metal, coloured, faint)
@@ -69,7 +68,7 @@ def set_metals_due(state: State, progress: float) -> None:
             metallic.fill_(float(HELD[0]))
         else:
             metallic[metal] = metallic[metal].clamp(min=raw_metallic(METAL))
-    state.forget_moments("metallic", metal | refuted)
+    state.learned.forget("metallic", metal | refuted)
     state.metals_set = True
     part = float(weight[metal].sum()) / max(whole, 1e-6)
     state.announce("metals", f"{part:.0%} of the surface shines as metals do")
@@ -89,14 +88,14 @@ def judge_due(state: State, progress: float) -> None:
     surfels, seen, fit = mirrored.observe(state)
     found = same_material.decide(surfels, seen, fit)
     names = "metallic", "albedo", "roughness"
-    metallic, albedo, roughness = (state.parameters[name] for name in names)
+    metallic, albedo, roughness = (state.learned[name] for name in names)
     free = ~torch.isin(metallic.detach(), HELD.to(metallic))
     raised, lowered = (which.to(metallic.device) & free for which in (found.metal, found.paint))
     like = torch.logit(found.like_metals.clamp(0.02, 0.98)).to(metallic.device)
     metallic[raised], metallic[lowered] = raw_metallic(METAL), raw_metallic(PAINT)
     albedo[raised], roughness[raised] = like[raised, :3], like[raised, 3]
     for name in names:
-        state.forget_moments(name, raised | lowered)
+        state.learned.forget(name, raised | lowered)
     whole = max(float(seen.pixels.sum()), 1e-6)
     parts = [float(seen.pixels[which.cpu()].sum()) / whole for which in (raised, lowered)]
     if max(parts) > TOLD:
@@ -116,8 +115,8 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
         return None
     surfels, seen, fit = mirrored.observe(state)
     found = same_material.doubt(surfels, seen, fit)
-    if "metallic" in state.parameters:
-        held = torch.isin(state.parameters["metallic"], HELD.to(state.device)).cpu()
+    if "metallic" in state.learned:
+        held = torch.isin(state.learned["metallic"], HELD.to(state.device)).cpu()
         found[held & (seen.pixels > same_material.FRINGE)] = 0
     weight = seen.pixels * state.wanted().cpu()
     part = float(weight[found >= DOUBTFUL].sum()) / max(float(weight.sum()), 1e-6)
@@ -131,20 +130,20 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
 def _decidable(state: State) -> bool:
     """Tell whether photos decide what is metal: not in schedules that find metals otherwise, or that have no specular shading."""
     settings = state.settings
-    return settings.render.reflection == "microfacet" and not settings.propagation.every and needs.decidable(state)
+    return settings.render.reflection == "microfacet" and not settings.propagation.every and decidable(state)
 
 
 @torch.no_grad()
 def hold_as(state: State, kinds: torch.Tensor) -> None:
     """Hold the metallic of surfels from now on (see `hold`). `kinds` (N,) has their index in `hints.KINDS`, −1 for those that learn."""
-    metallic, which = state.parameters["metallic"], kinds >= 0
+    metallic, which = state.learned["metallic"], kinds >= 0
     metallic[which] = HELD.to(metallic)[kinds[which]]
-    state.forget_moments("metallic", which)
+    state.learned.forget("metallic", which)
     state.metals_set = True
 
 
 def hold(state: State) -> None:
     """Remove the gradient of the metallic of surfels that are held, so that it stays. Halves of a divided surfel are held, too."""
-    metallic = state.parameters.get("metallic")
+    metallic = state.learned.get("metallic")
     if state.metals_set and metallic is not None and metallic.grad is not None:
         metallic.grad.masked_fill_(torch.isin(metallic.detach(), HELD.to(metallic)), 0)

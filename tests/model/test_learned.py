@@ -1,9 +1,9 @@
-"""Compare the program's Adam optimiser with torch's in float64. Both leave an element alone if its gradient is zero."""
+"""Compare the program's Adam with torch's in float64. Both leave an element alone if its gradient is zero."""
 
 import torch
 from torch import Tensor
 
-from refgs.model.adam import Adam
+from refgs.model.learned import Learned
 from tests.makers import scenes
 
 SHAPES = [(1,), (1000, 3), (20_000,), (777, 4), (5, 2, 3)]
@@ -24,7 +24,7 @@ def tensors(steps: int) -> tuple[list[Tensor], list[list[Tensor]]]:
     return values, gradients
 
 
-def train(optimizer: torch.optim.Optimizer | Adam, values: list[Tensor], gradients: list[list[Tensor]]) -> None:
+def train(optimizer: torch.optim.Optimizer | Learned, values: list[Tensor], gradients: list[list[Tensor]]) -> None:
     for step in gradients:
         for value, gradient in zip(values, step, strict=True):
             value.grad = None if gradient is None else gradient.to(value)
@@ -49,28 +49,33 @@ class Held(torch.optim.Adam):
         return [state[name] if name in state else torch.zeros_like(value) for name in ("exp_avg", "exp_avg_sq")]
 
 
-def groups(values: list[Tensor]) -> list[dict]:
-    return [{"params": [value], "lr": rate} for value, rate in zip(values, RATES, strict=True)]
+def learned_of(values: list[Tensor]) -> Learned:
+    learned = Learned()
+    for number, (value, rate) in enumerate(zip(values, RATES, strict=True)):
+        learned.learn(str(number), value)
+        learned.rates[str(number)] = rate
+    return learned
 
 
 def test_matches_float64(device):
     start, gradients = tensors(20)
     gradients[7][3][::3], gradients[11][2][100:5000] = 0, 0
     exact = [v.double().requires_grad_() for v in start]
-    train(Held(groups(exact), eps=1e-15), exact, gradients)
-    values = [v.to(device, copy=True).requires_grad_() for v in start]
-    optimizer = Adam(groups(values))
-    train(optimizer, values, gradients)
+    groups = [{"params": [value], "lr": rate} for value, rate in zip(exact, RATES, strict=True)]
+    train(Held(groups, eps=1e-15), exact, gradients)
+    learned = learned_of([v.to(device, copy=True) for v in start])
+    values = [*learned.values()]
+    train(learned, values, gradients)
     for value, expected, begun, rate in zip(values, exact, start, RATES, strict=True):
         assert (value.cpu() - expected).abs().max() <= 2e-7 * begun.abs().max() * 20 + 1e-5 * rate
-    assert [optimizer.state[v]["step"] for v in values] == [20, 19, 20, 20, 20]
+    assert [moments.steps for moments in learned.moments.values()] == [20, 19, 20, 20, 20]
 
 
 def test_same_bits_for_any_number_of_threads():
     def all_of_it() -> list[Tensor]:
         start, gradients = tensors(5)
-        values = [v.requires_grad_() for v in start]
-        train(Adam(groups(values)), values, gradients)
-        return [v.detach() for v in values]
+        learned = learned_of(start)
+        train(learned, [*learned.values()], gradients)
+        return [v.detach() for v in learned.values()]
 
     scenes.check_same_bits_for_any_number_of_threads(all_of_it)

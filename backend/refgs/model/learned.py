@@ -1,0 +1,225 @@
+"""Hold the tensors that a training learns, and let Adam learn them."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from refgs.clock import timed
+from refgs.kernels.layout import struct
+from refgs.kernels.load import run
+
+LOGIT = 12.0  # beyond, float32 cannot tell a logistic function from its limit, and its slope is of no use
+LIMITS = {
+    "opacity": (-LOGIT, LOGIT),
+    "albedo": (-LOGIT, LOGIT),
+    "roughness": (-LOGIT, LOGIT),
+    "metallic": (-LOGIT / 2, LOGIT / 2),  # activated by a function that nears its limits as the square
+    "exposure": (-LOGIT, LOGIT),  # natural logarithms: 17 stops
+}
+DARKEST = -LOGIT  # raw light: below, softplus' slope, which is the radiance itself, is of no use
+SMALLEST, LARGEST = 1e-6, 1e2  # of a surfel, in scene radii
+
+_Tensor = struct("Learned", "adam.cpp")
+_Work = struct("Adam", "adam.cpp")
+
+
+@dataclass
+class Moments:
+    """Hold Adam's moments of a tensor: the running `mean` of its gradient and of the gradient's `square`, after so many `steps`."""
+
+    steps: int
+    mean: Tensor
+    square: Tensor
+
+
+class Learned(Mapping[str, Tensor]):
+    """Hold the tensors that a training learns, by name, with Adam's moments, learning rates and limits.
+
+    A tensor is by row if it has a row for each surfel. Those rows are replaced together. A tensor by row that gets no gradient, such as a
+    mask, only follows. `constant` has the tensors that do not learn any more: one row for all surfels.
+
+    One kernel updates all tensors with Adam (Kingma and Ba 2015). Elements whose gradient is zero keep their value and their moments. So a
+    surfel that is not visible does not move. In the original Adam it would still move, because its moments decay slowly.
+    """
+
+    BETAS, EPSILON = (0.9, 0.999), 1e-15
+
+    def __init__(self, radius: float = 1.0, brightest: float = math.inf) -> None:
+        """Start without tensors. `radius` is the scene's, and `brightest` the highest raw value of the light's texels: see `limits`."""
+        self.rates: dict[str, float] = {}
+        self.moments: dict[str, Moments] = {}  # of those that had a gradient
+        self.constant: dict[str, Tensor] = {}
+        self._radius, self._brightest = radius, brightest
+        self._values: dict[str, Tensor] = {}
+        self._by_row: set[str] = set()
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    @property
+    def by_row(self) -> dict[str, Tensor]:
+        """Return the tensors that have a row for each surfel, by name."""
+        return {name: value for name, value in self._values.items() if name in self._by_row}
+
+    @property
+    def count(self) -> int:
+        """Return the number of surfels."""
+        return len(self._values["position"])
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Return the lowest and the highest raw value, before activation, that a tensor may take.
+
+        Beyond these limits, gradients would be too small to move the value back.
+        """
+        if name == "scale":
+            return math.log(SMALLEST * self._radius), math.log(LARGEST * self._radius)
+        if name == "environment":
+            return DARKEST, self._brightest
+        return LIMITS.get(name, (-math.inf, math.inf))
+
+    def learn(self, name: str, value: Tensor, by_row: bool = True) -> None:
+        """Learn a tensor, from the values in `value`, without moments. A tensor of this name is replaced, and keeps its rate."""
+        self._values[name] = _leaf(value)
+        self.moments.pop(name, None)
+        self.constant.pop(name, None)
+        self.rates.setdefault(name, 0.0)
+        if by_row:
+            self._by_row.add(name)
+
+    def drop(self, *names: str) -> None:
+        """Stop learning tensors, if they are learned. Those by row become constant: all surfels have the values of the first one."""
+        for name in {*names} & {*self._values}:
+            value = self._values.pop(name)
+            self.moments.pop(name, None)
+            del self.rates[name]
+            if name in self._by_row:
+                self._by_row.remove(name)
+                self.constant[name] = value.detach()[:1].clone()
+
+    @torch.no_grad()
+    def rows(self, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
+        """Replace all surfels by the rows `index` of their tensors. A row may be taken more than once.
+
+        Each row keeps its moments. Only the rows whose indices in the result are in `fresh` start with zero moments. Adam then moves these
+        rows faster than others at first. Pictures get worse for a while, but for captures without masks, the final result is better. If
+        memory runs out, all surfels stay as they were.
+        """
+        values = {name: _leaf(value.detach()[index]) for name, value in self.by_row.items()}
+        moments = {}
+        for name in values.keys() & self.moments.keys():
+            old = self.moments[name]
+            moments[name] = Moments(old.steps, old.mean[index], old.square[index])
+            for which in fresh:
+                moments[name].mean[which] = moments[name].square[which] = 0
+        self._values |= values
+        self.moments |= moments
+
+    def columns(self, name: str, count: int) -> None:
+        """Keep only the first `count` columns of a tensor, such as spherical harmonic coefficients, and of its moments."""
+        self._values[name] = _leaf(self._values[name].detach()[:, :count].contiguous())
+        if old := self.moments.get(name):
+            mean, square = (moment[:, :count].contiguous() for moment in (old.mean, old.square))
+            self.moments[name] = Moments(old.steps, mean, square)
+
+    @torch.no_grad()
+    def fill(self, name: str, value: Tensor | float) -> None:
+        """Set a tensor to a value, or to values for all or each of its rows. Forget its moments."""
+        self._values[name][:] = value
+        self.forget(name)
+
+    def forget(self, name: str, which: Tensor | None = None) -> None:
+        """Set the moments of a tensor to zero where `which` (N,) is true. Without it, Adam starts anew with the tensor."""
+        if which is None:
+            self.moments.pop(name, None)
+        elif old := self.moments.get(name):
+            old.mean[which] = old.square[which] = 0
+
+    def gradients(self) -> list[Tensor]:
+        """Return the gradients that the last backward pass has computed."""
+        return [value.grad for value in self._values.values() if value.grad is not None]
+
+    def forget_gradients(self) -> None:
+        """Drop the gradients of the last backward pass."""
+        for value in self._values.values():
+            value.grad = None
+
+    @timed("optimiser")
+    @torch.no_grad()
+    def step(self, accepted: Tensor | None = None) -> None:
+        """Update all tensors that have a gradient, once, with their learning rates.
+
+        `accepted` is a float32 scalar on the tensors' device, or None. If it is zero, values and moments do not change.
+        """
+        (beta1, beta2), learned, kept = self.BETAS, [], []
+        for name, value in self._values.items():
+            if value.grad is None:
+                continue
+            moments = self.moments.get(name)
+            if moments is None:
+                moments = self.moments[name] = Moments(0, torch.zeros_like(value), torch.zeros_like(value))
+            moments.steps += 1
+            work = _Tensor(count=value.numel(), rate=self.rates[name] / (1 - beta1**moments.steps))
+            work.square_scale, (work.low, work.high) = (1 - beta2**moments.steps) ** -0.5, self.limits(name)
+            gradient = value.grad.contiguous()
+            work.attach(value=value, mean=moments.mean, square=moments.square, gradient=gradient)
+            learned.append(work)
+            kept.append(gradient)
+        if not learned:
+            return
+        work = _Work(tensors=len(learned))
+        work.learned[: len(learned)] = learned
+        work.beta1, work.beta2, work.epsilon = beta1, beta2, self.EPSILON
+        if accepted is not None:
+            work.attach(accepted=accepted)
+        run("refgs_adam_step", work, kept[0], items=sum(gradient.numel() for gradient in kept))
+
+    def save(self) -> dict[str, Tensor]:
+        """Return all tensors and moments for a checkpoint, by names that `load` knows."""
+        tensors = {self._kept(name): value for name, value in self._values.items()}
+        tensors |= {f"constant.{name}": value for name, value in self.constant.items()}
+        for name, moments in self.moments.items():
+            tensors |= {f"adam.{name}.step": torch.tensor(moments.steps)}
+            tensors |= {f"adam.{name}.exp_avg": moments.mean, f"adam.{name}.exp_avg_sq": moments.square}
+        return tensors
+
+    def load(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take over the tensors of a checkpoint that are learned here, and those that are constant here.
+
+        Tensors of only one row there and learned here, or the other way round, are expanded or shortened: they were left out, or brought
+        back, after this checkpoint. Those that are not by row and not there are dropped. Raises KeyError if another one is missing.
+        """
+        rows = len(tensors["parameter.position"])
+        self.moments.clear()
+        for name in [*self._values]:
+            value = tensors.get(self._kept(name))
+            if value is None and name not in self._by_row:
+                self.drop(name)
+                continue
+            if value is None:
+                one = tensors[f"constant.{name}"]
+                value = one.expand(rows, *one.shape[1:]).clone()
+            self._values[name] = _leaf(value)
+            if f"adam.{name}.step" in tensors:
+                mean, square = (tensors[f"adam.{name}.{key}"] for key in ("exp_avg", "exp_avg_sq"))
+                self.moments[name] = Moments(int(tensors[f"adam.{name}.step"]), mean, square)
+        for name in self.constant:
+            learned = tensors.get(f"parameter.{name}")
+            self.constant[name] = tensors[f"constant.{name}"] if learned is None else learned[:1]
+
+    def _kept(self, name: str) -> str:
+        """Return the name of a tensor in a checkpoint."""
+        return f"parameter.{name}" if name in self._by_row else name
+
+
+def _leaf(value: Tensor) -> Tensor:
+    """Return a tensor that gets gradients, unless it holds no floats."""
+    return value.detach().requires_grad_(value.is_floating_point())
