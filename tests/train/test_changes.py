@@ -6,7 +6,7 @@ The photos are renderings of the model itself, whose materials are known.
 import pytest
 import torch
 
-from refgs.model.surfels import activate
+from refgs.model.surfels import activate, raw_metallic
 from refgs.train.decide.materials import CHANGES
 from refgs.train.learn.densify import densify
 from refgs.train.material import changes, even_metal, metals
@@ -183,19 +183,19 @@ def test_what_is_metal_all_over_is_held(made, roughness):
     put(made, metallic=0.0)
     state.iteration = metals.SOONEST
     metals.set_metals_due(state, 0.25)
-    held = int((state.learned["metallic"] == metals.HELD[0]).sum())
+    held = int(state.learned["held"].sum())
     assert held > 0.9 * len(state.learned["metallic"])
     before = state.learned["roughness"].detach().clone()
     for _ in range(5):
         made.step()
-    assert int((state.learned["metallic"] == metals.HELD[0]).sum()) == held
+    assert int((state.learned["metallic"] == raw_metallic(metals.HELD["metal"])).sum()) == held
     assert not torch.equal(state.learned["roughness"], before)
     gradient = torch.ones(state.learned.count)
     divided = densify(state.learned, gradient, state.settings.densify, 2 * len(gradient), divide=True)
     state.reset_motion()
     made.step()
     assert divided > 0
-    assert int((state.learned["metallic"] == metals.HELD[0]).sum()) > held + 0.9 * divided
+    assert int((state.learned["metallic"] == raw_metallic(metals.HELD["metal"])).sum()) > held + 0.9 * divided
 
 
 @pytest.mark.parametrize("albedo, even", [(ORANGE, True), ([1.0, 1.0, 1.0], False)])
@@ -217,3 +217,14 @@ def test_paint_is_averaged_on_coloured_metal_only(made, albedo, even):
         assert float(found[upper].mean()) == pytest.approx(float(noise[upper].mean()), abs=0.03)
     else:
         assert torch.equal(state.learned["albedo"], paint)
+
+
+def test_a_metallic_that_has_the_held_value_by_chance_still_learns(ball_capture, tmp_path):
+    made = small(ball_capture, tmp_path / "run", "train.light_first=0", total=100)
+    put(made, metallic=raw_metallic(metals.HELD["metal"]))
+    made.state.metals_set = True
+    before = made.state.learned["metallic"].detach().clone()
+    put(made, held=torch.arange(len(before)) % 2 == 0)
+    made.step()
+    moved = made.state.learned["metallic"] != before
+    assert not moved[::2].any() and moved[1::2].any()

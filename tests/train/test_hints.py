@@ -11,6 +11,7 @@ from refgs import train_job
 from refgs.errors import InputError
 from refgs.formats.hints import FILE, Hint, read_hints, write_hints
 from refgs.formats.splats import read_splats
+from refgs.model.surfels import raw_metallic
 from refgs.run_folder import read_run_facts
 from refgs.train.decide import needs
 from refgs.train.hints import AGAIN, AT_MOST, continue_with_hints, hinted_kinds
@@ -22,7 +23,7 @@ from refgs.train.material import metals
 from tests.makers.training import TINY, put, trained, trainer
 
 TOTAL = 400
-METAL, PAINT = metals.HELD
+METAL, PAINT = (torch.tensor(raw_metallic(metals.HELD[kind])) for kind in ("metal", "paint"))
 
 
 def silent(event, facts):

@@ -207,7 +207,7 @@ def test_the_asset_has_the_doubt_of_the_surfels_that_are_written(made):
 def test_metals_that_are_held_are_not_in_doubt(made):
     show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
     made.state.learned["environment"].data[:] = made.state.learned["environment"].data.mean()
-    put(made, metallic=float(metals.HELD[0]))
+    put(made, metallic=raw_metallic(metals.HELD["metal"]), held=True)
     facts = metals.doubt(made.state)[1]
     assert facts["part"] < 0.002 and "what" not in facts, "only what hardly any pixel shows is"
 
@@ -250,8 +250,8 @@ def test_materials_are_judged_with_new_meshes_unless_held(made, iteration, progr
     """Check that nothing changes between meshes, when the residual learns, and where metals are held."""
     show(made, metallic=-6.0, roughness=-1.0)
     state = made.state
-    before = float(metals.HELD[0]) if held else raw_metallic(0.9)
-    put(made, metallic=before)
+    before = raw_metallic(0.9)
+    put(made, metallic=before, held=held)
     state.iteration = iteration
     metals.judge_due(state, progress)
     assert bool((state.learned["metallic"] == torch.tensor(before)).all())

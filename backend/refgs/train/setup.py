@@ -16,6 +16,7 @@ from refgs.train.decide.light_frame import light_frame
 from refgs.train.decide.object_size import limit_surfels, object_size
 from refgs.train.effective import Effective
 from refgs.train.learn import coarse, light, poses, priors
+from refgs.train.material import metals
 from refgs.train.photo import Photo
 from refgs.train.plan import Plan
 from refgs.train.start import start_appearance, start_parameters
@@ -81,6 +82,8 @@ def _start_learning(state: State, start: Parameters) -> None:
         exposures = torch.zeros(len(state.views), len(EXPOSURE), device=state.device)
         state.learned.learn("exposure", exposures, by_row=False)
     state.learned.drop(*_unused(state), *method.constants)
+    if "metallic" in state.learned:
+        metals.hold_none(state)
     for name, value in method.constants.items():
         state.learned.constant[name].fill_(value)
     state.reset_motion()

@@ -8,7 +8,7 @@ from torch import Tensor
 from refgs.model.surfels import Surfels
 from refgs.train import probe
 from refgs.train.decide.need import ASKED, MEGA, Decision, Moment, Need, megabytes
-from refgs.train.material import changes
+from refgs.train.material import changes, metals
 from refgs.train.start import start_appearance
 from refgs.train.state import RenderInputs, State, why_not_traced
 from refgs.train.timeline import SOONEST
@@ -62,11 +62,12 @@ class Specular(Need):
     def apply(self, state: State, found: dict[str, Any]) -> None:
         state.change("render.reflection", "none", "needs", found["why"])
         state.occluder = None
-        state.learned.drop("metallic", "roughness", *INDIRECT)
+        state.learned.drop("metallic", "roughness", "held", *INDIRECT)
 
     def undo(self, state: State, why: str) -> None:
         state.change("render.reflection", state.effective.asked.render.reflection, "needs", why)
         _learn_again(state, ["metallic", "roughness", *(() if why_not_traced(state) else INDIRECT)])
+        metals.hold_none(state)
         state.metals_set = False
 
     def look_again(self, state: State) -> Decision | None:

@@ -77,7 +77,7 @@ def _check_tensors(tensors: dict[str, torch.Tensor], run: Path) -> None:
         if kind in ("parameter", "constant", "motion"):
             fine &= value.shape[:1] == ((1,) if kind == "constant" else rows)
         if kind in ("parameter", "constant", "environment", "exposure"):
-            fine &= value.dtype == torch.float32
+            fine &= value.dtype == (torch.bool if rest == "held" else torch.float32)
         if kind == "adam":
             of, _, moment = rest.rpartition(".")
             learned = tensors.get(of if of in ("environment", "exposure") else f"parameter.{of}")

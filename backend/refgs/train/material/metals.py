@@ -9,6 +9,7 @@ again, since roughness, light and base colour explain rough metal and paint abou
 
 import torch
 
+from refgs.formats.hints import KINDS
 from refgs.model.surfels import raw_metallic
 from refgs.train.material import mirrored, same_material
 from refgs.train.material.changes import falls_as_metal, observe, shines_as_metal
@@ -25,9 +26,7 @@ TELLING = (
 )
 TOLD = 0.005  # part of the surface, above which a change is announced
 DOUBTFUL = 0.5  # doubt from which on photos do not tell
-HELD = torch.tensor(
-    [raw_metallic(0.98), raw_metallic(0.002)]
-)  # raw metallic that is held, of each of `formats.hints.KINDS`; surfels that have exactly this value are known by it
+HELD = {"metal": 0.98, "paint": 0.002}  # metallic that is held, of each of `formats.hints.KINDS`
 
 
 def set_metals_due(state: State, progress: float) -> None:
@@ -65,7 +64,8 @@ def set_metals_due(state: State, progress: float) -> None:
         metallic[refuted] = metallic[refuted].clamp(max=raw_metallic(PAINT))
         if shining > CERTAIN * whole or (faintly > CERTAIN * whole and shown_faintly.by_mirroring):
             metal = torch.ones_like(metal)
-            metallic.fill_(float(HELD[0]))
+            metallic.fill_(raw_metallic(HELD["metal"]))
+            state.learned["held"][:] = True
         else:
             metallic[metal] = metallic[metal].clamp(min=raw_metallic(METAL))
     state.learned.forget("metallic", metal | refuted)
@@ -89,7 +89,7 @@ def judge_due(state: State, progress: float) -> None:
     found = same_material.decide(surfels, seen, fit)
     names = "metallic", "albedo", "roughness"
     metallic, albedo, roughness = (state.learned[name] for name in names)
-    free = ~torch.isin(metallic.detach(), HELD.to(metallic))
+    free = ~state.learned["held"]
     raised, lowered = (which.to(metallic.device) & free for which in (found.metal, found.paint))
     like = torch.logit(found.like_metals.clamp(0.02, 0.98)).to(metallic.device)
     metallic[raised], metallic[lowered] = raw_metallic(METAL), raw_metallic(PAINT)
@@ -115,9 +115,8 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
         return None
     surfels, seen, fit = mirrored.observe(state)
     found = same_material.doubt(surfels, seen, fit)
-    if "metallic" in state.learned:
-        held = torch.isin(state.learned["metallic"], HELD.to(state.device)).cpu()
-        found[held & (seen.pixels > same_material.FRINGE)] = 0
+    if "held" in state.learned:
+        found[state.learned["held"].cpu() & (seen.pixels > same_material.FRINGE)] = 0
     weight = seen.pixels * state.wanted().cpu()
     part = float(weight[found >= DOUBTFUL].sum()) / max(float(weight.sum()), 1e-6)
     facts = {"part": part}
@@ -136,14 +135,20 @@ def _decidable(state: State) -> bool:
 @torch.no_grad()
 def hold_as(state: State, kinds: torch.Tensor) -> None:
     """Hold the metallic of surfels from now on (see `hold`). `kinds` (N,) has their index in `hints.KINDS`, −1 for those that learn."""
-    metallic, which = state.learned["metallic"], kinds >= 0
-    metallic[which] = HELD.to(metallic)[kinds[which]]
-    state.learned.forget("metallic", which)
+    for number, kind in enumerate(KINDS):
+        state.learned["metallic"][kinds == number] = raw_metallic(HELD[kind])
+    state.learned["held"].copy_(kinds >= 0)
+    state.learned.forget("metallic", kinds >= 0)
     state.metals_set = True
 
 
+def hold_none(state: State) -> None:
+    """Let the metallic of all surfels learn. `held` (N,) is true for those whose metallic stays; halves of a divided one are held, too."""
+    state.learned.learn("held", torch.zeros(state.learned.count, dtype=torch.bool, device=state.device))
+
+
 def hold(state: State) -> None:
-    """Remove the gradient of the metallic of surfels that are held, so that it stays. Halves of a divided surfel are held, too."""
+    """Remove the gradient of the metallic of surfels that are held, so that it stays."""
     metallic = state.learned.get("metallic")
-    if state.metals_set and metallic is not None and metallic.grad is not None:
-        metallic.grad.masked_fill_(torch.isin(metallic.detach(), HELD.to(metallic)), 0)
+    if metallic is not None and metallic.grad is not None:
+        metallic.grad.masked_fill_(state.learned["held"], 0)
