@@ -21,7 +21,7 @@ from refgs.compare.pictures import as_bytes, composite, write_png
 from refgs.render.align import fitted
 from refgs.settings import load_settings
 from refgs.train.keep.measures import held_out_psnr
-from refgs.train.learn.poses import shifts
+from refgs.train.learn.poses import Poses, shifts
 from refgs.train.state import State, spread
 from refgs.train.trainer import Trainer
 
@@ -79,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 begun, state = time.process_time(), trainer.state
                 trainer.run()
             seconds = time.process_time() - begun
-            moved = f"{np.median(shifts(state)):.2f}" if state.poses is not None else "–"
+            moved = f"{np.median(shifts(state)):.2f}" if state.part(Poses).values is not None else "–"
             figures = (
                 held_out_psnr(state, len(state.test)),
                 fitted_psnr(state, given.pictures and given.pictures / f"{folder.name}_{run}"),

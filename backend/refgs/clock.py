@@ -20,15 +20,21 @@ _watching: "Clock | None" = None
 
 
 class Clock:
-    """Add up the seconds that a device spends in each part of a training. `seconds` maps a part's name to its total."""
+    """Add up the seconds that a device spends in each part of a training.
+
+    `seconds` maps a part's name to its total. `processor` are the seconds of all threads in all iterations, which other programs hardly
+    change.
+    """
 
     def __init__(self, device: torch.device):
         self.seconds: dict[str, float] = {}
+        self.processor = 0.0
         self._on_card, self._within = device.type == "cuda", False
         self._events: list[tuple[str, torch.cuda.Event, torch.cuda.Event]] = []
 
-    def resume(self, seconds: dict[str, float]) -> None:
+    def resume(self, seconds: dict[str, float], processor: float) -> None:
         """Add the seconds of each part from a checkpoint, when an interrupted training is resumed."""
+        self.processor = processor
         for name, value in seconds.items():
             self._add(name, value)
 

@@ -407,7 +407,7 @@ def _costs(trainer: "Trainer") -> dict[str, Any]:
     import torch
 
     state = trainer.state
-    costs = {"training_seconds": state.seconds, "processor_seconds": state.processor_seconds}
+    costs = {"training_seconds": state.seconds, "processor_seconds": state.clock.processor}
     costs["steps_left_out"] = trainer.guard.left_out
     costs |= _most_memory()
     if state.device.type == "cuda":

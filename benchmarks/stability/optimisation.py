@@ -161,7 +161,7 @@ CUTS: dict[int, Callable[[Trainer], bool]] = {
     20: lambda made: made.state.initial,
     37: lambda made: not made.state.initial and made.state.occluder is None,
     52: lambda made: made.state.occluder is not None,
-    75: lambda made: faint_now(made.state),
+    75: lambda made: faint_now(made.state, made.state.iteration),
     90: lambda made: made.state.iteration > made.state.residual_start * made.state.total,
 }
 """Iterations to stop at and a test for each stage: light first, per surfel, deferred, inter-reflection, after a reset, residual."""

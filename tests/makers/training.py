@@ -8,7 +8,9 @@ from refgs.capture import read_capture
 from refgs.run import create_run, open_run
 from refgs.settings import LossSettings, load_settings
 from refgs.train.keep.asset import write_asset
-from refgs.train.trainer import Trainer
+from refgs.train.state import State
+from refgs.train.timeline import AFTER, BEFORE, Step
+from refgs.train.trainer import Trainer, walk
 
 SMALL = [
     "surfels.start=1500",
@@ -62,6 +64,15 @@ def check_equal(one: Trainer, other: Trainer) -> None:
     """
     assert one.state.decided == other.state.decided
     torch.testing.assert_close(learned(one), learned(other), rtol=0, atol=0)
+
+
+def do(state: State, what: str, progress: float | None = None, done: int | None = None, hidden: float | None = None):
+    """Do what the row `what` of the timeline does, if it is due at a `progress` when so many iterations are `done`; by default, now."""
+    step = Step(state)
+    step.progress = step.progress if progress is None else progress
+    step.done = step.done if done is None else done
+    step.hidden = hidden
+    walk(tuple(row for row in (*BEFORE, *AFTER) if row.what == what), state, step)
 
 
 def put(made: Trainer, **values) -> None:

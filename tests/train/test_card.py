@@ -13,6 +13,7 @@ from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode, unset_fake
 from refgs.kernels import cuda
 from refgs.model import prefilter
 from refgs.render import raster_cuda, shade
+from refgs.train.learn.light import MirroredLight
 from tests.makers.emulate import emulate
 from tests.makers.occluders import as_occluder
 from tests.makers.training import TINY, trainer
@@ -123,7 +124,7 @@ def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, ind
             tree._boxes, tree._triangles = (torch.empty(v.shape, device=CARD) for v in (tree._boxes, tree._triangles))
             made.state.occluder = ball
         # The training computes at its start which texels of the light the object shows.
-        made.state.light_shown = torch.empty(len(made.state.learned["environment"]), device=CARD)
+        made.state.part(MirroredLight).weight = torch.empty(len(made.state.learned["environment"]), device=CARD)
         figures = made.step()
         assert all(figure.device == CARD for figure in figures.values())
         assert all(value.grad is None and value.device == CARD for value in made.state.learned.values())

@@ -8,11 +8,12 @@ import torch
 
 from refgs.model.surfels import activate, raw_metallic
 from refgs.train.decide.materials import CHANGES
-from refgs.train.learn.densify import densify
-from refgs.train.material import changes, even_metal, metals
+from refgs.train.learn.densify import Densification, densify
+from refgs.train.material import changes, metals
 from refgs.train.material.changing_light import CHANGED, LEFT, explained
+from refgs.train.material.metals import Metals
 from tests.makers.lamps import LAMPS, ORANGE, show
-from tests.makers.training import put
+from tests.makers.training import do, put
 from tests.makers.training import trainer as small
 
 ALL = ["surfels.sh_degree=0", "needs.specular=on", "needs.outside=off"]
@@ -114,8 +115,7 @@ def test_a_light_that_changes_does_not_make_metal(made):
     assert found.by_changes and found.lit > 0.375 and found.lit - found.mirrored > 1.5 * CHANGED
     assert found.both - found.lit < 0.5 * LEFT * (1 - found.lit)
     put(made, metallic=0.0)
-    state.iteration = metals.SOONEST
-    metals.set_metals_due(state, 0.25)
+    do(state, "find metals", 0.25, done=100)
     assert (state.surfels().metallic < 1.01 * metals.PAINT).all() and "0%" in state.decided["metals"]
 
 
@@ -135,8 +135,7 @@ def test_coloured_noise_does_not_make_metal(made):
     state.change("render.reflection", "microfacet", "needs", "the photos do not tell this")
     assert told(made)[0] > 0.3, "its colours alone are a metal's"
     put(made, metallic=0.0)
-    state.iteration = metals.SOONEST
-    metals.set_metals_due(state, 0.25)
+    do(state, "find metals", 0.25, done=100)
     assert float((state.surfels().metallic < 1.01 * metals.PAINT).float().mean()) > 0.9
     assert "0%" in state.decided["metals"] and state.settings.loss.dark > 0
 
@@ -153,16 +152,15 @@ def test_metals_are_set_once(made):
     show(made, metallic=6.0, roughness=-1.0)
     state = made.state
     put(made, metallic=0.0)
-    metals.set_metals_due(state, 0.05)
-    state.iteration = metals.SOONEST
-    metals.set_metals_due(state, 0.05)
-    assert not state.metals_set and "metals" not in state.decided
-    metals.set_metals_due(state, 0.25)
+    do(state, "find metals", 0.25, done=99)
+    do(state, "find metals", 0.05, done=100)
+    assert not state.part(Metals).found and "metals" not in state.decided
+    do(state, "find metals", 0.25, done=100)
     metallic = activate(state.learned.constant | state.learned.by_row).metallic
-    assert state.metals_set and float((metallic > metals.METAL - 1e-3).float().mean()) > 0.5
+    assert state.part(Metals).found and float((metallic > metals.METAL - 1e-3).float().mean()) > 0.5
     assert "as metals do" in state.decided["metals"] and state.settings.loss.dark == 0
     put(made, metallic=0.0)
-    metals.set_metals_due(state, 0.3)
+    do(state, "find metals", 0.3, done=101)
     assert (state.learned["metallic"] == 0).all()
 
 
@@ -170,9 +168,8 @@ def test_propagation_finds_metals_by_itself(large_ball, tmp_path):
     made = small(large_ball, tmp_path / "run", *ALL, "propagation.every=20", total=400)
     show(made, metallic=6.0, roughness=-1.0)
     put(made, metallic=0.0)
-    made.state.iteration = metals.SOONEST
-    metals.set_metals_due(made.state, 0.25)
-    assert not made.state.metals_set and (made.state.learned["metallic"] == 0).all()
+    do(made.state, "find metals", 0.25, done=100)
+    assert not made.state.part(Metals).found and (made.state.learned["metallic"] == 0).all()
 
 
 @pytest.mark.parametrize("roughness", [-1.0, 1.0])  # rough metal changes by less than may be texture out of place
@@ -181,8 +178,7 @@ def test_what_is_metal_all_over_is_held(made, roughness):
     show(made, metallic=6.0, roughness=roughness)
     state = made.state
     put(made, metallic=0.0)
-    state.iteration = metals.SOONEST
-    metals.set_metals_due(state, 0.25)
+    do(state, "find metals", 0.25, done=100)
     held = int(state.learned["held"].sum())
     assert held > 0.9 * len(state.learned["metallic"])
     before = state.learned["roughness"].detach().clone()
@@ -192,7 +188,7 @@ def test_what_is_metal_all_over_is_held(made, roughness):
     assert not torch.equal(state.learned["roughness"], before)
     gradient = torch.ones(state.learned.count)
     divided = densify(state.learned, gradient, state.settings.densify, 2 * len(gradient), divide=True)
-    state.reset_motion()
+    state.part(Densification).restart(state)
     made.step()
     assert divided > 0
     assert int((state.learned["metallic"] == raw_metallic(metals.HELD["metal"])).sum()) > held + 0.9 * divided
@@ -206,10 +202,11 @@ def test_paint_is_averaged_on_coloured_metal_only(made, albedo, even):
     noise = 0.5 * torch.randn(len(upper), 1, generator=torch.Generator().manual_seed(0))
     paint = torch.tensor(albedo) + noise  # brighter and darker
     put(made, metallic=torch.where(upper, 6.0, -6.0), albedo=paint, opacity=2.0)
-    state.metals_set, state.iteration = True, even_metal.EVERY
-    even_metal.even_out_due(state, even_metal.UNTIL)
+    state.part(Metals).found = True
+    do(state, "even coloured metal out", 0.6, done=50)
+    do(state, "even coloured metal out", 0.5, done=51)
     assert torch.equal(state.learned["albedo"], paint)
-    even_metal.even_out_due(state, 0.5)
+    do(state, "even coloured metal out", 0.5, done=50)
     found = state.learned["albedo"].detach() - torch.tensor(albedo)
     assert torch.equal(state.learned["albedo"][~upper], paint[~upper])
     if even:
@@ -222,7 +219,7 @@ def test_paint_is_averaged_on_coloured_metal_only(made, albedo, even):
 def test_a_metallic_that_has_the_held_value_by_chance_still_learns(ball_capture, tmp_path):
     made = small(ball_capture, tmp_path / "run", "train.light_first=0", total=100)
     put(made, metallic=raw_metallic(metals.HELD["metal"]))
-    made.state.metals_set = True
+    made.state.part(Metals).found = True
     before = made.state.learned["metallic"].detach().clone()
     put(made, held=torch.arange(len(before)) % 2 == 0)
     made.step()

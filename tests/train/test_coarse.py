@@ -1,5 +1,7 @@
 """Test that a training starts on reduced photos where the object is large enough, and that large photos are held once."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,8 @@ from refgs import train_job
 from refgs.capture import cached
 from refgs.train.decide.object_size import object_size
 from refgs.train.learn import coarse
+from refgs.train.learn.coarse import Coarse
+from refgs.train.learn.poses import Poses
 from refgs.train.plan import FULL, Stage
 from tests.makers.training import check_equal, trainer
 
@@ -17,7 +21,7 @@ FEW = ["train.checkpoint_every=1000", "needs.specular=on"]
 @pytest.fixture
 def large(monkeypatch):
     """Let the objects of small test captures count as large."""
-    monkeypatch.setattr(coarse, "LEAST", 10)
+    monkeypatch.setattr(coarse, "LEAST_SPAN", 10)
 
 
 @pytest.mark.parametrize(
@@ -32,15 +36,15 @@ def test_photos_are_reduced_as_long_as_the_object_stays_large(pixels, factors):
 
 def test_a_small_object_is_trained_on_full_photos(ball_capture, tmp_path):
     state = trainer(ball_capture, tmp_path / "run").state
-    assert state.reduced is None and state.stages == FULL
+    assert state.part(Coarse).factor == 1 and state.part(Coarse).stages == FULL
     assert 30 < object_size(state).span < 64
 
 
 def test_where_the_object_is_not_known_photos_are_full(ball_capture, tmp_path, large):
     """Check that photos without masks are not reduced, and that a small region in a large object counts as small."""
     state = trainer(ball_capture, tmp_path / "run").state
-    assert state.reduced is not None
-    state.from_hull = False
+    assert state.part(Coarse).factor > 1
+    state.views[3] = replace(state.views[3], alpha=None)
     assert object_size(state).span == 0
     small = ["region.centre=[0.0,0.0,0.9]", "region.size=[0.2,0.2,0.2]"]
     assert 0 < object_size(trainer(ball_capture, tmp_path / "part", *small).state).span < 20
@@ -55,19 +59,19 @@ def test_each_stage_has_its_photos_and_decisions_see_full_ones(ball_capture, tmp
     while not made.state.ended:
         seen.clear()
         made.step()
-        factor = made.state.reduced.factor if made.state.reduced else 1
+        factor = made.state.part(Coarse).factor
         factors.append(factor)
         view = next(v for v in made.state.views if v.camera.name == seen[0].name)
         assert seen[0].fx == pytest.approx(view.camera.fx / factor)
         assert made.state.photo(0, whole=True).image.shape[0] == 64
-        assert made.state.photo(0, whole=True, reduced=True).image.shape[0] == 64 // factor
+        assert coarse.photo(made.state, 0, whole=True).image.shape[0] == 64 // factor
     assert factors == [4] * 14 + [2] * 14 + [1] * 12
 
 
 def test_reduced_photos_have_crops_of_their_own(ball_capture, tmp_path, large):
     state = trainer(ball_capture, tmp_path / "run", "needs.outside=off", total=40).state
-    assert state.crops is not None and state.reduced.crops is not None
-    photo = state.photo(0, reduced=True)
+    assert state.crops is not None and state.part(Coarse).crops is not None
+    photo = coarse.photo(state, 0, whole=False)
     assert photo.whole == (16, 16) and photo.image.shape[0] <= 16
 
 
@@ -78,7 +82,7 @@ def test_photos_are_never_reduced_again(ball_capture, tmp_path, large):
         made.step()
     made.state.total = 40
     made.step()
-    assert made.state.reduced is None
+    assert made.state.part(Coarse).factor == 1
 
 
 @pytest.mark.parametrize("stop", [10, 20, 30])
@@ -88,7 +92,7 @@ def test_resumed_in_every_stage_it_is_the_same_training(ball_capture, tmp_path, 
     first.run(lambda: first.state.iteration == stop)
     second = trainer(ball_capture, folder, *FEW, total=40)
     second.resume()
-    assert (second.state.reduced is None) == (stop == 30)
+    assert (second.state.part(Coarse).factor == 1) == (stop == 30)
     for made in (first, second):
         made.run()
     check_equal(first, second)
@@ -96,17 +100,22 @@ def test_resumed_in_every_stage_it_is_the_same_training(ball_capture, tmp_path, 
 
 def test_a_moved_camera_moves_that_of_the_reduced_photo(ball_capture, tmp_path, large):
     state = trainer(ball_capture, tmp_path / "run", total=40).state
-    state.move_camera(0, state.given[1])
-    for photo, side in ((state.photos[0], 64), (state.reduced.photos[0], 16)):
-        assert photo.camera.name == state.given[1].name and photo.camera.width == side
-        np.testing.assert_array_equal(photo.camera.world_to_camera, state.given[1].world_to_camera)
+    given = state.part(Poses).given
+    given[0] = given[1]
+    state.part(Poses).move(state, 0)
+    for photo, side in ((state.photos[0], 64), (state.part(Coarse).photos[0], 16)):
+        assert photo.camera.name == given[1].name and photo.camera.width == side
+        np.testing.assert_array_equal(photo.camera.world_to_camera, given[1].world_to_camera)
 
 
 def test_iterations_on_reduced_photos_cost_less(ball_capture, tmp_path, large):
     state = trainer(ball_capture, tmp_path / "run", total=100).state
     half = Stage(0.7, 2).cost
-    assert state.cost(70, 100) == pytest.approx(30) and state.cost(40, 50) == pytest.approx(10 * half)
-    assert state.cost(0, 100) == pytest.approx(state.cost(0, 40) + state.cost(40, 100)) and half < 0.5
+    assert coarse.cost(state, 70, 100) == pytest.approx(30) and coarse.cost(state, 40, 50) == pytest.approx(10 * half)
+    assert (
+        coarse.cost(state, 0, 100) == pytest.approx(coarse.cost(state, 0, 40) + coarse.cost(state, 40, 100))
+        and half < 0.5
+    )
 
 
 def test_large_photos_are_held_once_and_leave_no_files(ball_capture, tmp_path, large, monkeypatch):

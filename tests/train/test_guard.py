@@ -17,7 +17,9 @@ from refgs.render.directional import directional
 from refgs.render.rasterize import rasterize
 from refgs.render.shade import shade
 from refgs.settings import load_settings
-from refgs.train.learn.guard import MOST_IN_A_ROW, Guard, remove_broken, running
+from refgs.train.keep.progress import running
+from refgs.train.learn.densify import Densification
+from refgs.train.learn.guard import MOST_IN_A_ROW, Guard, remove_broken
 from refgs.train.screen_gradient import ScreenGradient
 from refgs.train.timeline import faint
 from tests.makers import scenes
@@ -143,7 +145,7 @@ def test_broken_surfels_are_removed_and_that_is_said(ball_capture, tmp_path):
     broken = count - made.state.learned.count
     assert 4 <= broken <= 6 and all(v.isfinite().all() for v in made.state.learned.by_row.values())
     assert any("not taken" in line for line in said) and any("removed" in line for line in said)
-    assert len(made.state.motion.total) == made.state.learned.count
+    assert len(made.state.part(Densification).gradient.total) == made.state.learned.count
 
 
 def test_a_broken_light_goes_back_to_the_checkpoint(ball_capture, tmp_path):

@@ -11,6 +11,7 @@ from benchmarks.scenes.analytic import F0, ONE, sky
 from refgs.capture import read_capture
 from refgs.formats.exr import read_exr, write_exr
 from refgs.formats.panorama import directions
+from refgs.train import timeline
 from refgs.train.keep import history
 from tests.makers import scenes
 from tests.makers.ball import dusk
@@ -27,7 +28,7 @@ def rows(folder):
 
 
 def test_lines_are_evenly_spaced_by_logarithm():
-    found = [i for i in range(20_000) if history.due(i)]
+    found = [i for i in range(20_000) if timeline.even_by_logarithm(i)]
     assert found[0] == 10 and {100, 1000, 10_000} <= set(found)
     assert sum(100 <= i < 1000 for i in found) == sum(1000 <= i < 10_000 for i in found) == 10
     ratios = np.divide(found[5:], found[4:-1])
@@ -41,7 +42,7 @@ def test_measuring_has_its_share(cost, lines):
     The training has 3,000 iterations of 0.1 s. A measurement takes `cost` seconds. `lines` is how many measurements are expected.
     """
     spent, at = 0.0, []
-    for i in [*filter(history.due, range(3000)), 3000]:
+    for i in [*filter(timeline.even_by_logarithm, range(3000)), 3000]:
         if i == 3000 or spent <= history.allowed(i, 3000, 0.1 * i):
             spent += cost
             at.append(i)
@@ -110,7 +111,7 @@ def test_a_resumed_run_records_the_same(ball_capture, tmp_path, monkeypatch):
     second.resume()
     assert rows(tmp_path / "cut")[-1]["iteration"] == 20 == second.state.iteration
     second.run()
-    others = {"seconds", "parts", "loss", "psnr_train"}  # the running means of loss and psnr_train start anew
+    others = {"seconds", "parts"}
     whole, cut = (
         [{name: row[name] for name in row.keys() - others} for row in rows(tmp_path / run)] for run in ("whole", "cut")
     )

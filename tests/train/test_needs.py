@@ -29,7 +29,7 @@ from refgs.train.plan import Plan
 from refgs.train.state import why_not_traced
 from refgs.train.timeline import RESET, SEEN, faint_now
 from tests.makers.occluders import as_occluder, plate
-from tests.makers.training import asset_error, check_equal, put
+from tests.makers.training import asset_error, check_equal, do, put
 from tests.makers.training import trainer as small
 
 DULL = ["surfels.metallic=0.01", "surfels.roughness=0.8"]  # a matte start, because the trainings are short
@@ -85,7 +85,7 @@ def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
     assert trainer(matte, tmp_path / "on", "needs.specular=off", "needs.iterations=on", total=150).state.total == 150
     forced.state.needs.clear()
     forced.state.plan = Plan(1.0)
-    needs.evaluate_due(forced.state, "start")
+    needs.evaluate(forced.state, "start")
     assert "iterations" not in forced.state.needs
 
 
@@ -249,11 +249,11 @@ def test_reflections_by_what_they_could_be_worth(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", "surfels.metallic=0.9", total=150)
     made.run(stop=lambda: made.state.iteration == 99)
     made.state.occluder = as_occluder(plate(0.5, -1), scale=3.0)  # faces down, above the ball
-    needs.evaluate_mesh(made.state, 0.2)
+    do(made.state, "decide on inter-reflection", hidden=0.2)
     found = made.state.needs.pop("reflections")
     assert found["needed"] and found["statistic"] > lighting.Reflections.threshold
     put(made, metallic=-10, albedo=0, roughness=5)
-    needs.evaluate_mesh(made.state, 0.2)
+    do(made.state, "decide on inter-reflection", hidden=0.2)
     assert not made.state.needs["reflections"]["needed"]
 
 
@@ -276,7 +276,7 @@ def test_reflections_of_a_small_part_are_kept(ball_capture, tmp_path, hidden):
         state.occluder = None
         state.photos = [with_rendering(state, p, noise=0.1)._replace(mask=p.mask) for p in state.photos]
         state.occluder = as_occluder(plate(1.2, -1), scale=0.9)
-        needs.evaluate_mesh(state, hidden)
+        do(state, "decide on inter-reflection", hidden=hidden)
         found = state.needs.pop("reflections")
         assert found["needed"] == chrome
         assert found["threshold"] == lighting.Reflections.SMALL_PART  # the whole decided nothing
@@ -333,7 +333,7 @@ def test_a_photo_that_its_object_fills_stays_whole(ball_capture, tmp_path, monke
         view.alpha[:] = 255
     made.state.photos, made.state.crops = [Photo.of(view) for view in made.state.views], None
     del made.state.needs["outside"]
-    needs.evaluate_due(made.state, "start")
+    needs.evaluate(made.state, "start")
     assert made.state.crops is None
 
 
@@ -343,10 +343,14 @@ def test_surfels_that_are_faint_decide_nothing_and_are_no_mesh(ball_capture, tmp
     made = trainer(ball_capture, tmp_path / "run", *changes, total=60)
     way = 4 * math.log(SEEN / (1 - SEEN) * (1 - RESET) / RESET)  # iterations that surfels stay faint, at a rate of one
     made.run(stop=lambda: made.state.iteration >= 5 + math.floor(way))
-    assert faint_now(made.state) and made.state.iteration > 60 * lighting.Light.SETTLED
+    assert faint_now(made.state, made.state.iteration) and made.state.iteration > 0.19 * 60
     assert "light" not in made.state.needs and made.state.occluder is None
     made.run(stop=lambda: made.state.iteration >= 24)
-    assert not faint_now(made.state) and "light" in made.state.needs and made.state.occluder is not None
+    assert (
+        not faint_now(made.state, made.state.iteration)
+        and "light" in made.state.needs
+        and made.state.occluder is not None
+    )
 
 
 def test_what_the_part_about_the_mask_saves_is_timed(ball_capture, tmp_path, monkeypatch):
@@ -394,7 +398,7 @@ def test_degrees_by_what_they_are_worth(ball_capture, tmp_path):
             for view, photo in enumerate(made.state.photos):
                 made.state.photos[view] = with_rendering(made.state, photo)
         made.state.needs.pop("degrees", None)
-        needs.evaluate_due(made.state, "iteration", progress=1.0)
+        do(made.state, "decide on degrees of harmonics", progress=1.0)
         assert made.state.learned["sh_rest"].shape[1] == kept
         assert made.state.needs["degrees"]["needed"] == (kept == 15)
     made.step()

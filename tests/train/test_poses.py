@@ -12,7 +12,8 @@ from refgs.capture.matches import Matches
 from refgs.run import open_run
 from refgs.settings import load_settings
 from refgs.train.learn import poses
-from tests.makers.training import check_equal, trained, trainer
+from refgs.train.learn.poses import Poses
+from tests.makers.training import check_equal, do, trained, trainer
 
 ON = "cameras.poses=on"
 
@@ -26,21 +27,21 @@ def test_nothing_moves_before_poses_learn_nor_in_the_last_third(ball_capture, tm
     made = trainer(ball_capture, tmp_path / "run", ON, total=60)
     while made.state.iteration < 3:
         made.iterate()
-    assert not made.state.poses.any()
+    assert not made.state.part(Poses).values.any()
     while made.state.iteration < 40:
         made.iterate()
-    before = made.state.poses.clone()
+    before = made.state.part(Poses).values.clone()
     assert before.any()
     while made.state.iteration < 60:
         made.iterate()
-    assert torch.equal(made.state.poses, before)
+    assert torch.equal(made.state.part(Poses).values, before)
 
 
 def shared_points(state, count=40):
     """Make matches without noise: what exact cameras see of some points, for each view and the next."""
     points = np.random.default_rng(0).normal(size=(count, 3)) * 0.5 * state.capture.radius + state.capture.centre
     pixels = []
-    for camera in state.given:
+    for camera in state.part(Poses).given:
         seen = np.c_[points, np.ones(count)] @ camera.projection.T
         pixels.append(seen[:, :2] / seen[:, 2:])
     return [Matches(i, i + 1, pixels[i], pixels[i + 1]) for i in range(len(pixels) - 1)]
@@ -53,20 +54,20 @@ def test_poses_are_kept_only_if_features_fit_them_better(ball_capture, tmp_path,
     pairs, off = shared_points(state), torch.zeros(len(state.views), 6)
     off[::2, 0] = 0.05
     if not exact:
-        poses.restore(state, off)
-        state.given = [view.camera for view in state.views]
-    poses.restore(state, off if exact else -off)
+        state.part(Poses).put(state, off)
+        state.part(Poses).given = [view.camera for view in state.views]
+    state.part(Poses).put(state, off if exact else -off)
 
     def matched(views):
         """Refined cameras may have other neighbours, with nothing in common: the given ones must tell."""
-        return pairs if [view.camera for view in views] == state.given else []
+        return pairs if [view.camera for view in views] == state.part(Poses).given else []
 
     monkeypatch.setattr(poses, "match_neighbours", matched)
-    poses.put_back_if_worse(state, 0.29)
+    do(state, "judge the poses", 0.29)
     assert "poses" not in state.decided
-    poses.put_back_if_worse(state, 0.31)
-    assert (state.poses is None) == exact and ("are kept" in state.decided["poses"]) == exact
-    own = [view.camera is given for view, given in zip(state.views, state.given, strict=True)]
+    do(state, "judge the poses", 0.31)
+    assert (state.part(Poses).values is None) == exact and ("are kept" in state.decided["poses"]) == exact
+    own = [view.camera is given for view, given in zip(state.views, state.part(Poses).given, strict=True)]
     assert all(own) if exact else not any(own)
 
 
@@ -74,7 +75,7 @@ def test_poses_are_kept_only_if_features_fit_them_better(ball_capture, tmp_path,
 def test_poses_are_refined_if_features_contradict_the_cameras(ball_capture, tmp_path, monkeypatch, apart, refined):
     monkeypatch.setattr(poses, "pixels_apart", lambda matches, cameras: apart)
     state = trainer(ball_capture, tmp_path / "run", "cameras.poses=auto", total=60).state
-    assert (state.poses is not None) == refined == ("poses" in state.decided)
+    assert (state.part(Poses).values is not None) == refined == ("poses" in state.decided)
 
 
 def test_refined_poses_are_written(ball_capture, moved, tmp_path):
@@ -94,8 +95,11 @@ def test_refined_poses_are_written(ball_capture, moved, tmp_path):
 def test_a_motion_that_all_views_share_is_removed(moved, tmp_path):
     made = trainer(moved, tmp_path / "run", ON, total=60)
     common = torch.tensor([0.01, 0.02, 0.0, 0.1, 0.0, 0.2])
-    made.state.poses = common.expand(len(made.state.views), 6).clone()
-    assert poses._without_common(made.state)[:, :3].abs().max() < 1e-6
+    made.state.part(Poses).put(made.state, common.expand(len(made.state.views), 6).clone())
+    do(made.state, "remove the poses' common motion", 0.2, done=len(made.state.views) - 1)
+    assert torch.equal(made.state.part(Poses).values[0], common)
+    do(made.state, "remove the poses' common motion", 0.2, done=len(made.state.views))
+    assert made.state.part(Poses).values[:, :3].abs().max() < 1e-6
 
 
 def test_a_resumed_training_has_the_same_poses(moved, tmp_path):
@@ -107,4 +111,5 @@ def test_a_resumed_training_has_the_same_poses(moved, tmp_path):
     second.resume()
     second.run()
     check_equal(whole, second)
-    assert torch.equal(whole.state.poses, second.state.poses) and whole.state.poses.any()
+    one, other = (made.state.part(Poses).values for made in (whole, second))
+    assert torch.equal(one, other) and one.any()

@@ -45,7 +45,7 @@ def test_the_axes_of_normals_are_found(ball, tmp_path, signs, says):
     state = started(ball, tmp_path / "run")
     assert says in state.decided["prior normals"] and "24 of 24 photos" in state.decided["prior normals"]
     for view in (0, 7):
-        codes, camera = state.priors.normals[view]
+        codes, camera = state.part(priors.Priors).normals[view]
         true, _ = true_maps(camera)
         known = codes.float().norm(dim=-1) > 64
         np.testing.assert_allclose(codes[known] / priors.CODE, true[known], atol=0.03)
@@ -59,7 +59,7 @@ def test_normals_of_something_else_are_left_out(ball, tmp_path):
         turned = np.rot90(picture, number % 4)
         cv2.imwrite(str(file), turned)
     state = started(ball, tmp_path / "run")
-    assert not state.priors.normals
+    assert not state.part(priors.Priors).normals
     assert "without normals from elsewhere for 24 of 24 photos" in state.decided["prior normals"]
 
 
@@ -68,7 +68,7 @@ def test_files_for_some_photos_are_used_for_these(ball, tmp_path):
     for file in sorted((ball / "normals").iterdir())[5:]:
         file.unlink()
     state = started(ball, tmp_path / "run")
-    assert len(state.priors.normals) == 5 and "5 of 24 photos" in state.decided["prior normals"]
+    assert len(state.part(priors.Priors).normals) == 5 and "5 of 24 photos" in state.decided["prior normals"]
 
 
 def test_nothing_is_used_without_masks(ball, tmp_path):
@@ -76,18 +76,18 @@ def test_nothing_is_used_without_masks(ball, tmp_path):
     capture = read_capture(ball)
     views = [replace(view, has_alpha=False) for view in capture.views]
     state = started(replace(capture, views=views), tmp_path / "run", "image.masks=off")
-    assert not state.priors.normals and "mask" in state.decided["priors"]
+    assert not state.part(priors.Priors).normals and "mask" in state.decided["priors"]
 
 
 @pytest.mark.parametrize(("disparity", "scale", "shift"), [(False, 1, 0), (False, 0.2, 3), (True, 1, 0), (True, 40, 5)])
 def test_depth_of_any_scale_and_shift_fits(ball, tmp_path, disparity, scale, shift):
     write_depth(ball, disparity, scale, shift)
     state = started(ball, tmp_path / "run")
-    assert state.priors.disparity == disparity
+    assert state.part(priors.Priors).disparity == disparity
     assert ("a disparity" if disparity else "a depth") in state.decided["prior depth"]
     camera = state.photos[3].camera
     true = torch.from_numpy(true_maps(camera)[1]).float()
-    guessed, counts = priors.at_pixels(*state.priors.depth[3], camera), (true > 0).float()
+    guessed, counts = priors.at_pixels(*state.part(priors.Priors).depth[3], camera), (true > 0).float()
     wrong = true + 0.5 * (torch.arange(64) < 20)  # a fifth of the rendering is wrong
     found, fits = priors.fitted(guessed, wrong, counts, disparity, 1.0)
     assert fits == 1

@@ -13,7 +13,7 @@ from refgs.train.keep.asset import write_asset
 from refgs.train.material import metals, mirrored, same_material
 from refgs.train.material.mirrored import Fit, Seen
 from tests.makers.lamps import show
-from tests.makers.training import put
+from tests.makers.training import do, put
 from tests.makers.training import trainer as small
 
 DIM = 1.0  # of lamps whose mirror images are not clipped: a radiance of 1.3, beside 0.2
@@ -24,7 +24,7 @@ ALL = ["surfels.sh_degree=0", "needs.specular=on", "needs.outside=off", "indirec
 @pytest.fixture
 def made(large_ball, tmp_path):
     made = small(large_ball, tmp_path / "run", *ALL, total=400)
-    made.state.metals_set, made.state.iteration = True, 100
+    made.state.part(metals.Metals).found, made.state.iteration = True, 100
     return made
 
 
@@ -228,7 +228,7 @@ def test_half_a_mirror_makes_all_of_it_metal(made):
     state.learned["albedo"].data[:] = half.logit()
     state.learned["albedo"].data[left] = -3.0
     state.learned["roughness"].data[left] = 1.0
-    metals.judge_due(state, 0.25)
+    do(state, "judge metals", 0.25)
     with torch.no_grad():
         found = activate(state.learned.constant | state.learned.by_row)
     assert float((found.metallic > 0.8)[left].float().mean()) > 0.95
@@ -241,7 +241,7 @@ def test_paint_that_was_taken_for_metal_becomes_paint(made):
     show(made, metallic=-6.0, roughness=-1.0)
     state = made.state
     put(made, metallic=raw_metallic(0.9))
-    metals.judge_due(state, 0.25)
+    do(state, "judge metals", 0.25)
     assert float((state.surfels().metallic < 0.1).float().mean()) > 0.3, "where lamps should show most clearly"
 
 
@@ -252,6 +252,5 @@ def test_materials_are_judged_with_new_meshes_unless_held(made, iteration, progr
     state = made.state
     before = raw_metallic(0.9)
     put(made, metallic=before, held=held)
-    state.iteration = iteration
-    metals.judge_due(state, progress)
+    do(state, "judge metals", progress, done=iteration)
     assert bool((state.learned["metallic"] == torch.tensor(before)).all())

@@ -25,17 +25,19 @@ class Decision(Model):
 
 
 class Facts(Model):
-    """Hold what a checkpoint knows besides its tensors. Values that have a default were not written by earlier releases."""
+    """Hold what a checkpoint knows besides its tensors.
+
+    `parts` are the facts of each part of the training that remembers something, by its name. `clock` are seconds by part of an iteration.
+    """
 
     iteration: Count
     total: Count
     seconds: Seconds
-    initial: bool | None = None
-    decided: dict[str, str] = Field(default_factory=dict)
-    parts: dict[str, Finite] = Field(default_factory=dict)
-    spent: Seconds | None = None
-    processor_seconds: Seconds = 0.0
-    needs: dict[str, Decision] = Field(default_factory=dict)
-    metals_set: bool = True
-    poses_judged: bool = True
-    reduced: Annotated[Count, Field(ge=1, le=64)] = 1
+    initial: bool
+    residual: bool
+    spent: Seconds
+    processor_seconds: Seconds
+    decided: dict[str, str]
+    clock: dict[str, Finite]
+    needs: dict[str, Decision]
+    parts: dict[str, dict[str, bool | Count]]

@@ -36,7 +36,9 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
     for _ in range(REHEARSED):
         float(trainer.iterate()["loss"])  # waits for a card
         marks.append(plan.spent)
-    pace = (marks[-1] - marks[WARM - 1]) / (REHEARSED - WARM) / trainer.state.stages[0].cost  # on full photos
+    pace = (
+        (marks[-1] - marks[WARM - 1]) / (REHEARSED - WARM) / trainer.state.part(coarse.Coarse).stages[0].cost
+    )  # on full photos
     views, first = len(capture.train_views) + len(capture.test_views), trainer.state.learned.count
     pixels, size = _pixels(capture, quick), object_size(trainer.state)
 

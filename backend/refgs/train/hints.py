@@ -16,6 +16,7 @@ from refgs.formats.splats import read_splats
 from refgs.settings import Settings
 from refgs.train.decide import needs
 from refgs.train.keep import snapshot
+from refgs.train.keep.progress import Means
 from refgs.train.material import metals
 from refgs.train.start import start_appearance
 from refgs.train.state import State
@@ -44,6 +45,7 @@ def continue_with_hints(state: State, run: Path, hints: list[Hint]) -> None:
     mirror = settings.model_copy(update={"surfels": settings.surfels.model_copy(update=MIRROR)})
     _restart(state, ("albedo", "roughness"), kinds == KINDS.index("metal"), mirror)
     _restart(state, ("sh_rest",), torch.ones_like(kinds, dtype=torch.bool), settings)
+    state.residual, state.part(Means).values = False, {}
     part = {kind: float((kinds == number).float().mean()) for number, kind in enumerate(KINDS)}
     what = ", ".join(f"{share:.0%} as {kind}" for kind, share in part.items() if share)
     state.report("stage", {"what": f"hints hold {what} of {len(kinds):,} surfels; training again from {AGAIN:.0%} on"})
@@ -68,8 +70,8 @@ def _go_back(state: State) -> None:
     If no time is given and the rest would take longer than AT_MOST, that is the time.
     """
     count, pace, plan = (1 - AGAIN) * state.total, state.seconds / max(state.iteration, 1), state.plan
-    state.seconds = state.processor_seconds = plan.before = 0.0
-    state.clock.resume({})
+    state.seconds = plan.before = 0.0
+    state.clock.resume({}, 0.0)
     if plan.minutes is None and count * pace > 60 * AT_MOST - plan.spent:
         plan.minutes = AT_MOST
     if plan.minutes is not None:

@@ -11,6 +11,9 @@ from refgs.capture import LoadedView
 
 MARGIN = 10  # pixels about the mask: no D-SSIM window, whose radius is 5, then sees both the object and the border
 
+Crop = tuple[slice, slice]
+"""Rows and columns of a photo."""
+
 
 class Photo(NamedTuple):
     """Hold a view's photo on the training's device: `image` (H, W, 3), sRGB codes, and `mask` (H, W) uint8 or None.
@@ -57,7 +60,7 @@ class Photo(NamedTuple):
         return self.image.float() >= torch.iinfo(self.image.dtype).max // 255 * 254
 
 
-def bounds(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
+def bounds(mask: np.ndarray, margin: int) -> Crop:
     """Return the smallest ranges of rows and columns that contain a mask (H, W), enlarged by `margin` pixels on each side.
 
     If the mask is empty, return all rows and columns.

@@ -3,8 +3,6 @@
 import time
 from typing import NamedTuple
 
-EVERY = 50  # iterations
-FIRST = 10  # iterations after which the pace is known well enough to plan the total
 # Time that writing the asset takes, in iterations: for each photo, for all of them are rendered, and besides.
 END_A_VIEW, END = 0.5, 20
 # Iterations grow slower as surfels are divided and inter-reflection joins: linearly between these parts of a training.
@@ -27,6 +25,11 @@ class Stage(NamedTuple):
 
 
 FULL = (Stage(1.0, 1),)
+
+
+def stage_at(progress: float, stages: tuple[Stage, ...]) -> Stage:
+    """Return the stage of a training at a progress of 0..1."""
+    return next(stage for stage in stages if progress < stage.until or stage.until == 1)
 
 
 def iterations_time(growth: float, progress: float, stages: tuple[Stage, ...] = FULL) -> float:
@@ -77,6 +80,11 @@ class Plan:
         """Record that the training has paused for `seconds`, which then do not count as time spent. This method does not wait."""
         self._begun += seconds
 
+    @property
+    def first(self) -> int:
+        """Return the iteration at which `begin` was called."""
+        return self._marks[0][0]
+
     def begin(self, iteration: int, growth: float, stages: tuple[Stage, ...] = FULL) -> None:
         """Start measuring the pace of iterations.
 
@@ -87,13 +95,12 @@ class Plan:
     def total(self, iteration: int, views: int) -> int | None:
         """Choose the total number of iterations so that the training ends in time.
 
-        The choice depends on how long iterations have taken so far. It is made FIRST iterations after `begin`, and then at every multiple
-        of EVERY. At other iterations, or without a time limit, returns None. `views` is the number of photos. They count because writing
-        the asset renders all of them.
+        The choice depends on how long iterations have taken since `begin`. Without a time limit, returns None. `views` is the number of
+        photos. They count because writing the asset renders all of them.
         """
-        done = iteration - self._marks[0][0]
-        if self.minutes is None or not (done == FIRST or (done > 0 and iteration % EVERY == 0)):
+        if self.minutes is None:
             return None
+        done = iteration - self.first
         # The pace of the later half predicts best, and includes densification and meshes at their usual share.
         half, then = next(mark for mark in reversed(self._marks) if mark[0] <= iteration - done / 2)
         now = self.spent

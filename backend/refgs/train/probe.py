@@ -18,6 +18,8 @@ from refgs.model.surfels import Surfels
 from refgs.render.rasterize import rasterize
 from refgs.render.rendering import COVERED, Rendering
 from refgs.render.volume import discs
+from refgs.train.learn.coarse import cost
+from refgs.train.learn.exposures import exposure
 from refgs.train.learn.losses import objective
 from refgs.train.photo import Photo
 from refgs.train.state import RenderInputs, State, spread
@@ -45,7 +47,7 @@ def without_specular(inputs: RenderInputs) -> RenderInputs:
 
 def picture(state: State, view: int, inputs: RenderInputs, whole: bool = False) -> Rendering:
     """Render a training view. Render only the crop that the training uses, or the whole view if `whole` is true."""
-    return state.picture(inputs, state.photo(view, whole).camera, state.exposure(view))
+    return state.picture(inputs, state.photo(view, whole).camera, exposure(state, view))
 
 
 class Lost(NamedTuple):
@@ -141,7 +143,7 @@ def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: b
                 torch.cuda.synchronize()
             fastest[which] = min(fastest[which], time.perf_counter() - begun)
             state.learned.forget_gradients()
-    return max(fastest[0] - fastest[1], 0.0) * max(state.cost(state.iteration, state.total), 0.0)
+    return max(fastest[0] - fastest[1], 0.0) * max(cost(state, state.iteration, state.total), 0.0)
 
 
 def pixel_sums(

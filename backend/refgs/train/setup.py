@@ -15,19 +15,33 @@ from refgs.train.decide import needs
 from refgs.train.decide.light_frame import light_frame
 from refgs.train.decide.object_size import limit_surfels, object_size
 from refgs.train.effective import Effective
-from refgs.train.learn import coarse, light, poses, priors
-from refgs.train.material import metals
+from refgs.train.keep.progress import Means
+from refgs.train.learn import coarse, light, priors
+from refgs.train.learn.coarse import Coarse
+from refgs.train.learn.densify import Densification
+from refgs.train.learn.exposures import EXPOSURE, Exposures
+from refgs.train.learn.light import MirroredLight
+from refgs.train.learn.poses import Poses
+from refgs.train.learn.priors import Priors
+from refgs.train.learn.trace import TracedMesh
+from refgs.train.material.metals import Metals
+from refgs.train.part import Part
 from refgs.train.photo import Photo
 from refgs.train.plan import Plan
 from refgs.train.start import start_appearance, start_parameters
-from refgs.train.state import EXPOSURE, State, why_not_traced
+from refgs.train.state import State, why_not_traced
+from refgs.train.timeline import Step
+
+PARTS: tuple[type[Part], ...] = (
+    Metals, Densification, Poses, Exposures, MirroredLight, TracedMesh, Coarse, Priors, Means,
+)  # fmt: skip
+"""The parts of a training that remember something, in the order in which a checkpoint restores them."""
 
 
 def set_up(capture: Capture, effective: Effective, folder: Path, report: Report, plan: Plan, device: str) -> State:
     """Read a capture's photos, and make all parameters and the optimiser, so that the first iteration can start."""
     state = State(capture, effective, folder, report, plan, device)
-    needs.evaluate_due(state, "photos")
-    state.given = [view.camera for view in state.views]
+    needs.evaluate(state, "photos")
     state.photos = [Photo.of(view, state.device) for view in state.views]
     with state.clock.part("start"):
         start, on_hull, source = start_parameters(capture, state.views, state.settings)
@@ -37,12 +51,14 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
             start, on_hull, source = start_parameters(capture, state.views, state.settings, hollows=True)
     report("stage", {"what": source})
     _start_learning(state, start)
-    poses.start(state)
-    needs.evaluate_due(state, "start")
+    state.parts = {kind: kind() for kind in PARTS}
+    for part in state.parts.values():
+        part.start(state)
+    needs.evaluate(state, "start")
     size = object_size(state)
     limit_surfels(state, size.area)
-    coarse.begin(state, size.span)
-    priors.start(state)
+    coarse.begin(state, size.span, refined=state.part(Poses).values is not None)
+    priors.load(state)
     return state
 
 
@@ -76,17 +92,14 @@ def _start_learning(state: State, start: Parameters) -> None:
     state.learned = Learned(state.capture.radius, method.light.brightest)
     for name, value in start.items():
         state.learned.learn(name, value.to(state.device))
-    texels = torch.empty(6 * light.resolution(settings, 0) ** 2, 3, device=state.device)
+    texels = torch.empty(6 * light.first_resolution(settings) ** 2, 3, device=state.device)
     state.learned.learn("environment", texels.fill_(light.start_value(state)), by_row=False)
     if method.lit and settings.light.exposure != "off":
         exposures = torch.zeros(len(state.views), len(EXPOSURE), device=state.device)
         state.learned.learn("exposure", exposures, by_row=False)
     state.learned.drop(*_unused(state), *method.constants)
-    if "metallic" in state.learned:
-        metals.hold_none(state)
     for name, value in method.constants.items():
         state.learned.constant[name].fill_(value)
-    state.reset_motion()
 
 
 def _unused(state: State) -> list[str]:
@@ -104,8 +117,13 @@ def _unused(state: State) -> list[str]:
     return unused
 
 
+def start_residual(state: State, step: Step) -> None:
+    """Let the residual learn: the colour by direction that material and light do not explain."""
+    state.residual = True
+
+
 @torch.no_grad()
-def start_deferred(state: State) -> None:
+def start_deferred(state: State, step: Step) -> None:
     """Start the second stage of a training, deferred shading: pixels are shaded after blending. The first stage shades each surfel.
 
     The surfels' geometry is kept. Colours, materials and light are reset and learned anew (Ref-Gaussian paper, §3.3).

@@ -1,9 +1,8 @@
 """Hold the state of a training: the capture, the parameters that it learns, and the decisions that it has made."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,13 +20,10 @@ from refgs.render.renderer import Rendering, near_plane, render
 from refgs.run_folder import PHOTOS
 from refgs.settings import LossSettings, RenderSettings, Settings
 from refgs.train.effective import Effective
-from refgs.train.photo import Photo
-from refgs.train.plan import FULL, Plan, Stage, iterations_time
-from refgs.train.screen_gradient import ScreenGradient
+from refgs.train.photo import Crop, Photo
+from refgs.train.plan import Plan
 
-# Changes of a photo's response, as logarithms of factors of red, green and blue: brightness, then temperature and tint, which are its white
-# balance. The latter two are scaled down so that they learn more slowly: photos differ less in them.
-EXPOSURE = (1.0, 1.0, 1.0), (0.5, 0.0, -0.5), (-0.25, 0.5, -0.25)
+P = TypeVar("P")
 
 
 def spread(items: Sequence, most: int) -> Sequence:
@@ -44,68 +40,49 @@ class RenderInputs(NamedTuple):
     occluder: Occluder | None
 
 
-class Reduced(NamedTuple):
-    """Hold the training views' photos, with their sides reduced by a `factor`, and the parts of them that are trained on (None: all)."""
-
-    factor: int
-    photos: list[Photo]
-    crops: list[tuple[slice, slice]] | None
-
-
-class Priors(NamedTuple):
-    """Hold what other programs guessed from the training views' photos (see `train/priors.py`), by the view's number.
-
-    A guess is a map and the photo's camera for its size: `normals` int8 (H, W, 3) in the camera's axes, and `depth` float32 (H, W) of any
-    scale and shift, which is a `disparity` for all views or for none. Both are 0 where nothing is known.
-    """
-
-    normals: dict[int, tuple[Tensor, Camera]]
-    depth: dict[int, tuple[Tensor, Camera]]
-    disparity: bool
-
-
 class State:
-    """Hold the state of a training: the capture, the parameters that it learns, and the decisions that it has made.
+    """Hold the state of a training: the capture, what it learns, and the decisions that it has made.
 
-    The constructor only reads the photos; `train/setup.py` makes the parameters, and `train/trainer.py` trains them. Attributes in the
-    second block of `__init__` are saved in checkpoints (`train/snapshot.py`). Those in the first block are made anew when a run is resumed.
+    The constructor only reads the photos; `train/setup.py` makes the surfels, and `train/trainer.py` trains them. What only one part of the
+    training needs to remember is in that part's own memory, `part(Kind)`.
     """
 
     def __init__(
         self, capture: Capture, effective: Effective, folder: Path, report: Report, plan: Plan, device: str
     ) -> None:
         self.capture, self.effective, self.folder, self.report = capture, effective, folder, report
-        self.device, self.near = torch.device(device), near_plane(capture.radius)
+        self.device = torch.device(device)
         self.background = torch.tensor(self.settings.image.background, device=self.device)
         self.clock, self.plan = Clock(self.device), plan
         with self.clock.part("reading"):
             views = [*capture.train_views, *capture.test_views]
             loaded = load_views(views, self.settings.image.max_side, folder / PHOTOS)
             self.views, self.test = loaded[: len(capture.train_views)], loaded[len(capture.train_views) :]
-        self.from_hull = all(view.alpha is not None for view in self.views)  # surfels start on the masks' hull
         self.photos: list[Photo] = []  # of the views
-        self.crops: list[tuple[slice, slice]] | None = (
-            None  # the parts of the photos that are trained on; None: all of them
-        )
-
-        self.priors = Priors({}, {}, False)
-        self.stages: tuple[Stage, ...] = FULL  # of the training, by its photos' sizes
-        self.reduced: Reduced | None = None  # photos that are trained on in an earlier stage; None: full photos
-
+        self.crops: list[Crop] | None = None  # the parts of the photos that are trained on; None: all of them
         self.iteration, self.total = 0, self.settings.train.iterations
-        self.seconds, self.processor_seconds = 0.0, 0.0  # the latter of all threads, which other programs hardly change
+        self.seconds = 0.0
         self.decided: dict[str, str] = {}  # lines for the artist, by what was decided
-        self.needs: dict[str, dict[str, Any]] = {}  # the decisions of `train/needs`, by the need's name
+        self.needs: dict[str, dict[str, Any]] = {}  # the decisions of `train/decide`, by the need's name
         self.initial = self.method.deferred and self.settings.initial.until > 0  # its stage is not over
-        self.metals_set = False  # whether `metals.set_metals_due` has set them
+        self.residual = False  # the residual learns (see `residual_start`)
         self.learned = Learned()  # surfels, "environment" (raw texels of the light), and "exposure" (one row a view)
-        self.light_shown: Tensor | None = None  # the weight of each texel in the light's mean
-        self.exposure_basis = torch.tensor(EXPOSURE, device=self.device)
-        self.given: list[Camera] = []  # the views' cameras in the capture
-        self.poses: Tensor | None = None  # (views, 6), see `train/poses.py`; None: cameras are the capture's own
-        self.poses_judged = False  # whether `poses.put_back_if_worse` has
-        self.motion = ScreenGradient(0, self.device)
         self.occluder: Occluder | None = None
+        self.parts: dict[type, Any] = {}
+
+    def part(self, kind: type[P]) -> P:
+        """Return the part of the training of this kind, with its memory (see `train/part.py`)."""
+        return self.parts[kind]
+
+    @property
+    def near(self) -> float:
+        """Return how near to a camera surfels are drawn."""
+        return near_plane(self.capture.radius)
+
+    @property
+    def from_hull(self) -> bool:
+        """Tell whether surfels start on the masks' hull: all photos have masks."""
+        return all(view.alpha is not None for view in self.views)
 
     @property
     def settings(self) -> Settings:
@@ -141,10 +118,9 @@ class State:
 
     def surfels(self) -> Surfels:
         """Compute the surfels from their raw parameters. A parameter that does not learn has one value for all surfels."""
-        count, late = self.learned.count, self.residual_start
+        count = self.learned.count
         values = activate(self.learned.by_row | self.learned.constant)
-        unlearned = late == 1 or self.iteration < late * self.total
-        if self.method.lit and self.settings.render.diffuse == "irradiance" and unlearned:
+        if self.method.lit and self.settings.render.diffuse == "irradiance" and not self.residual:
             values = values.without_directions()
         return Surfels(*(v if len(v) == count else v.expand(count, *v.shape[1:]) for v in values))
 
@@ -172,37 +148,10 @@ class State:
         inputs = self.inputs()
         return self.picture(inputs if surfels is None else inputs._replace(surfels=surfels), camera)
 
-    def photo(self, view: int, whole: bool = False, reduced: bool = False) -> Photo:
-        """Return the crop of a view's photo that the training uses, or the whole photo if `whole` is true.
-
-        The photo is in full size, so that decisions see all of it. If `reduced` is true, it has the size that is trained on now.
-        """
-        photos, crops = self.photos, self.crops
-        if reduced and self.reduced is not None:
-            _, photos, crops = self.reduced
-        return photos[view] if whole or crops is None else photos[view].part(*crops[view])
-
-    def move_camera(self, view: int, camera: Camera) -> None:
-        """Replace a training view's camera. It is the camera of the full photo."""
-        self.views[view] = replace(self.views[view], camera=camera)
-        self.photos[view] = self.photos[view]._replace(camera=camera)
-        if self.reduced is not None:
-            photo = self.reduced.photos[view]
-            self.reduced.photos[view] = photo._replace(camera=camera.resized(photo.camera.width, photo.camera.height))
-
-    def cost(self, first: int, last: int) -> float:
-        """Estimate how long the iterations from `first` to `last` take together, in iterations on full photos."""
-        begun, ended = (iterations_time(1.0, k / self.total, self.stages) for k in (first, last))
-        return self.total * (ended - begun)
-
-    def exposure(self, view: int | slice) -> Tensor | None:
-        """Compute a view's exposure (3,): factors of its rendered red, green and blue. Return None if exposures are not learned.
-
-        What is learned are the weights of the rows of EXPOSURE in the factors' natural logarithms. If it has only one column, the photos
-        have the same white balance, and a view's three factors are equal. A slice of views gives the exposures of all of them (V, 3).
-        """
-        weights = self.learned.get("exposure")
-        return None if weights is None else (weights[view] @ self.exposure_basis[: weights.shape[1]]).exp()
+    def photo(self, view: int, whole: bool = False) -> Photo:
+        """Return the crop of a view's photo that the training uses, or the whole photo if `whole` is true. It is in full size."""
+        photo = self.photos[view]
+        return photo if whole or self.crops is None else photo.part(*self.crops[view])
 
     def spread_cameras(self, least: int) -> list[Camera]:
         """Return the cameras of at least `least` training views, evenly spaced. If there are fewer views, return all cameras."""
@@ -230,10 +179,6 @@ class State:
         `by` says what caused the change, and `why` explains it in words.
         """
         self.effective = self.effective.changed(key, value, by, why)
-
-    def reset_motion(self) -> None:
-        """Restart the mean of the screen gradients, which says which surfels to divide. Call this after surfels have been replaced."""
-        self.motion = ScreenGradient(self.learned.count, self.device)
 
 
 def why_not_traced(state: State) -> str:

@@ -1,51 +1,169 @@
-"""Tell when things are done in a training."""
+"""Tell when each thing is done in a training: one row for each.
+
+`Trainer.step` walks BEFORE, renders a photo and takes a step of Adam, and then walks AFTER. `scripts/timeline_page.py` prints all rows into
+docs/timeline.md. No other module of the training compares its progress with anything.
+
+A training's progress is the part of its iterations that are done, 0..1.
+"""
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
+from refgs.render.rendering import Rendering
 from refgs.settings import DensifySettings, RateSettings
+from refgs.train.photo import Photo
+from refgs.train.start import GEOMETRY
 from refgs.train.state import State
 
 RESET = 0.01  # opacity
 SEEN = 0.2  # opacity from which on surfels explain a picture: nothing is decided, and no mesh is made, of fainter ones
-SOONEST = 100  # iterations: a mirror that has learned for fewer looks dull
+POSES_FROM, POSES_KNOWN, POSES_UNTIL = (
+    0.05,
+    0.3,
+    2 / 3,
+)  # parts of the training: poses start to learn, are judged, and are frozen
+WHOLE_EVERY = 8  # iterations: one of these sees its whole photo, so that nothing stays beyond the margin of a crop
+REFLECTING = ("albedo", "metallic", "roughness", "indirect_dc", "indirect_rest", "environment", "exposure")
+FIRST_LINE, A_DECADE = 10, 10  # of the history: iterations before it, and lines while iterations grow tenfold
 
 
-def decidable(state: State) -> bool:
-    """Tell whether surfels, materials and light can be judged now.
+class Step:
+    """Hold one iteration while it is done.
+
+    `progress` is the training's when the iteration begins. `done` counts iterations: those before this one, and from Adam's step on this
+    one, too. `view` is the training view. `hidden` is the part of the object's pixels that mirror the object, if this iteration has made
+    a mesh, else None. The `photo` and its `rendering` are known from Adam's step on.
+    """
+
+    photo: Photo
+    rendering: Rendering
+
+    def __init__(self, state: State, view: int = 0) -> None:
+        self.progress = min(state.iteration / state.total, 1.0)
+        self.done, self.view = state.iteration, view
+        self.hidden: float | None = None
+
+
+Test = Callable[[State, Step], bool]
+
+
+class When(NamedTuple):
+    """Hold a time of the training, or a condition: words for the page, and whether it has come, or holds."""
+
+    words: str
+    holds: Test
+
+    def __and__(self, other: "When") -> "When":
+        return When(
+            f"{self.words}, {other.words}", lambda state, step: self.holds(state, step) and other.holds(state, step)
+        )
+
+
+class Every(NamedTuple):
+    """Hold a period in iterations, 0 for never: words for the page, and its length."""
+
+    words: str
+    length: Callable[[State], int]
+
+
+class Row(NamedTuple):
+    """Tell when one thing is done: in each iteration from `start` on and before `until` whose number `every` divides, if `only_if` holds.
+
+    `clock` is the part of the training's time (`refgs.clock`) that it counts for; None if it keeps the time itself.
+    """
+
+    what: str
+    start: When | None = None
+    until: When | None = None
+    every: Every | None = None
+    only_if: When | None = None
+    clock: str | None = None
+
+    def due(self, state: State, step: Step) -> bool:
+        """Tell whether it is time."""
+        if self.every and not ((length := self.every.length(state)) and step.done % length == 0):
+            return False
+        if self.start and not self.start.holds(state, step):
+            return False
+        if self.until and self.until.holds(state, step):
+            return False
+        return not self.only_if or self.only_if.holds(state, step)
+
+
+def part(of: float) -> When:
+    """Return the time when this part of the training is over."""
+    return When(f"{of:.0%}", lambda state, step: step.progress >= of)
+
+
+def part_after_initial(of: float) -> When:
+    """Return the time when this part of the training is over, counted from the end of its initial stage."""
+    return When(f"`initial.until` + {of:.0%}", lambda state, step: step.progress - state.settings.initial.until >= of)
+
+
+def iteration(number: int) -> When:
+    """Return the time when so many iterations are done."""
+    return When(f"iteration {number}", lambda state, step: step.done >= number)
+
+
+def setting(key: str) -> When:
+    """Return the time of the setting `key`, "section.name", which is a part of the training."""
+    section, name = key.split(".")
+    return When(f"`{key}`", lambda state, step: step.progress >= getattr(getattr(state.settings, section), name))
+
+
+def period(key: str) -> Every:
+    """Return the period of the setting `key`, "section.name"."""
+    section, name = key.split(".")
+    return Every(f"`{key}`", lambda state: getattr(getattr(state.settings, section), name))
+
+
+def iterations(count: int) -> Every:
+    """Return a period of so many iterations."""
+    return Every(f"{count}", lambda state: count)
+
+
+def decidable(state: State, done: int) -> bool:
+    """Tell whether surfels, materials and light can be judged after `done` iterations.
 
     They cannot in the initial stage, while surfels are faint after an opacity reset, and in a method without materials of pixels.
     """
     by_pixels = state.method.deferred and state.settings.render.diffuse == "irradiance"
-    return by_pixels and not state.initial and not faint_now(state)
+    return by_pixels and not state.initial and not faint_now(state, done)
 
 
-def since_propagation(state: State) -> int | None:
+def metals_decidable(state: State, done: int) -> bool:
+    """Tell whether photos decide what is metal: not in schedules that find metals otherwise, or that have no specular shading."""
+    settings = state.settings
+    return settings.render.reflection == "microfacet" and not settings.propagation.every and decidable(state, done)
+
+
+def since_propagation(state: State, done: int) -> int | None:
     """Count the iterations since normals were last propagated (see `propagate_normals`).
 
     Returns None before the first propagation, and once the training no longer propagates normals.
     """
-    settings, iteration = state.settings.propagation, state.iteration
-    if not settings.every or iteration < settings.every or not state.method.lit:
+    settings = state.settings.propagation
+    if not settings.every or done < settings.every or not state.method.lit:
         return None
-    last = iteration // settings.every * settings.every
-    return iteration - last if last / state.total < settings.stop else None
+    last = done // settings.every * settings.every
+    return done - last if last / state.total < settings.stop else None
 
 
-def faint_now(state: State, opacity: float = SEEN) -> bool:
-    """Tell whether the last opacity reset was so recent that useful surfels may still be too transparent.
+def faint_now(state: State, done: int, opacity: float = SEEN) -> bool:
+    """Tell whether the last opacity reset was so recent that useful surfels may still be too transparent after `done` iterations.
 
     An opacity reset makes all surfels nearly transparent. Useful surfels become opaque again as they learn, and this function estimates
     whether they have had enough iterations to reach `opacity`.
     """
-    return faint(state.settings.densify, state.settings.rates, state.iteration, state.total, opacity)
+    return faint(state.settings.densify, state.settings.rates, done, state.total, opacity)
 
 
 def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total: int, opacity: float) -> bool:
     """Tell whether the last opacity reset before `iteration` was so recent that useful surfels may still be too transparent.
 
-    An opacity reset makes all surfels nearly transparent. Useful surfels become opaque again as they learn. The time until they reach
-    `opacity` is estimated: in each iteration, Adam moves an opacity's logit by about the learning rate, which decays. The function returns
-    true until four times this estimate has passed. `total` is the number of iterations of the training.
+    The time until they reach `opacity` is estimated: in each iteration, Adam moves an opacity's logit by about the learning rate, which
+    decays. The function returns true until four times this estimate has passed. `total` is the number of iterations of the training.
     """
     every = settings.reset_every
     last = min(iteration, math.ceil(settings.stop * total)) - 1  # a reset at the end of this iteration does not count
@@ -59,3 +177,126 @@ def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total:
     )
     opacity = max(opacity, RESET)
     return iterations * rates.opacity < 4 * math.log(opacity / (1 - opacity) * (1 - RESET) / RESET)
+
+
+def even_by_logarithm(iteration: int) -> bool:
+    """Tell whether the history should have a line for this iteration.
+
+    Lines are evenly spaced on a logarithmic axis: A_DECADE lines from iteration 10 to 100, as many from 100 to 1000, and so on.
+    """
+    place, before = (math.floor(A_DECADE * math.log10(max(i, 1))) for i in (iteration, iteration - 1))
+    return iteration >= FIRST_LINE and place > before
+
+
+def _late(state: State, part: float) -> float:
+    """Return the progress when this part of the time in which the residual learns is over."""
+    return state.residual_start + part * (1 - state.residual_start)
+
+
+def _resets(state: State, step: Step) -> bool:
+    """Tell whether opacities may be reset: before `densify.stop`, by the iterations that are done, and if no normals are propagated."""
+    return step.done / state.total < state.settings.densify.stop and since_propagation(state, step.done) != 0
+
+
+def _first_plan(state: State, step: Step) -> bool:
+    """Tell whether so many iterations are done since the plan began that their pace is known, for the first time or again."""
+    since = step.done - state.plan.first
+    return since == 10 or (since > 0 and step.done % 50 == 0)
+
+
+RESIDUAL = When("`residual.start`", lambda state, step: step.progress >= state.residual_start)
+LIGHT_FIRST = When("iteration `train.light_first`", lambda state, step: step.done >= state.settings.train.light_first)
+NOT_ENDED = When("not the last iteration", lambda state, step: step.done < state.total)
+INITIAL = When("the initial stage is not over", lambda state, step: state.initial)
+NOT_INITIAL = When("the initial stage is over", lambda state, step: not state.initial)
+SOLID = When("no opacity reset was just before", lambda state, step: not faint_now(state, step.done))
+PRUNABLE = When(
+    "an opacity reset is long enough past for `densify.prune_opacity`",
+    lambda state, step: not faint_now(state, step.done, state.settings.densify.prune_opacity),
+)
+DECIDABLE = When("pixels are shaded, no opacity reset was just before", lambda state, step: decidable(state, step.done))
+METALS = When(
+    "pixels are mirrors, no opacity reset was just before, `propagation.every` = 0",
+    lambda state, step: metals_decidable(state, step.done),
+)
+LIT = When("there is a light", lambda state, step: state.method.lit)
+FROM_HULL = When("all photos have masks", lambda state, step: state.from_hull)
+DEFERRED = When("pixels are shaded", lambda state, step: state.method.deferred)
+NEW_MESH = When("a mesh was made", lambda state, step: step.hidden is not None)
+RESTS = When(
+    "for `propagation.rest` iterations after normals were propagated",
+    lambda state, step: (since := since_propagation(state, step.done)) is not None
+    and since < state.settings.propagation.rest,
+)
+
+BEFORE = (
+    Row("take larger photos"),
+    Row("start the deferred stage", setting("initial.until"), only_if=INITIAL),
+    Row("start the residual", RESIDUAL),
+    Row("set the rates"),
+    Row("refine the light", part(0.2), only_if=LIT),
+)
+"""Is done before the photo is rendered."""
+
+WHOLE = Row("train on the whole photo, not on its crop", every=iterations(WHOLE_EVERY))
+FROZEN = (
+    (GEOMETRY, Row("hold the surfels' shapes", until=LIGHT_FIRST, only_if=FROM_HULL & DEFERRED)),
+    (("opacity",), Row("hold opacities", only_if=RESTS)),
+    (REFLECTING, Row("hold materials, light and exposures", RESIDUAL)),
+)
+"""Tensors that do not learn."""
+
+AFTER = (
+    Row("refine the view's pose", part(POSES_FROM), part(POSES_UNTIL)),
+    Row("remove the poses' common motion", part(POSES_FROM), part(POSES_UNTIL), Every("views", lambda s: len(s.views))),
+    Row("diffuse the light", only_if=LIT),
+    Row("balance the exposures"),
+    # Meshes and decisions come before an opacity reset makes all surfels faint. Materials would no longer adapt to a mesh that is made
+    # after the residual has started to learn.
+    Row("make a mesh", setting("indirect.start"), RESIDUAL, period("indirect.every"), NOT_INITIAL & NOT_ENDED & SOLID),
+    Row("decide on inter-reflection", only_if=NEW_MESH, clock="deciding"),
+    Row("trace what surfels receive", only_if=NEW_MESH, clock="visibility"),
+    Row("time the crops", iteration(100), only_if=DECIDABLE, clock="deciding"),
+    Row(
+        "look at a matte scene again",
+        When("50%", lambda state, step: 2 * step.done >= state.total),
+        only_if=DECIDABLE,
+        clock="deciding",
+    ),
+    Row("decide on specular shading", part_after_initial(0.05) & iteration(100), only_if=DECIDABLE, clock="deciding"),
+    Row("decide on the light's texels", part_after_initial(0.19), only_if=DECIDABLE, clock="deciding"),
+    Row(
+        "decide on degrees of harmonics",
+        When("70% from `residual.start` to the end", lambda state, step: step.progress >= _late(state, 0.7)),
+        only_if=DECIDABLE,
+        clock="deciding",
+    ),
+    Row("find metals", part_after_initial(0.1) & iteration(100), RESIDUAL, only_if=METALS, clock="deciding"),
+    Row("judge metals", None, RESIDUAL, period("indirect.every"), FROM_HULL & METALS, clock="deciding"),
+    Row("even coloured metal out", None, part(0.6), iterations(50)),
+    Row("prune and divide surfels", setting("densify.start"), None, period("densify.every"), PRUNABLE),
+    Row(
+        "propagate normals",
+        every=period("propagation.every"),
+        only_if=When("before `propagation.stop`", lambda state, step: since_propagation(state, step.done) == 0),
+        clock="densification",
+    ),
+    Row(
+        "reset opacities",
+        every=period("densify.reset_every"),
+        only_if=When("before `densify.stop`, normals are not propagated", _resets),
+    ),
+    Row("leave out exposures that agree", part(0.3), None, period("densify.every"), NOT_INITIAL & SOLID),
+    Row("judge the poses", part(POSES_KNOWN)),
+)
+"""Is done after Adam's step."""
+
+DIVIDE = Row("divide surfels, not only prune", until=setting("densify.stop"))
+PLAN = Row("plan the iterations that fit into the time", only_if=When("10 after the start, then every 50", _first_plan))
+REPORT = Row("report the progress, look for broken numbers", every=iterations(10))
+RECORD = Row(
+    "measure errors into the history",
+    only_if=NOT_ENDED
+    & When("10 times while iterations grow tenfold", lambda state, step: even_by_logarithm(step.done)),
+)
+CHECKPOINT = Row("write a checkpoint", every=period("train.checkpoint_every"), only_if=NOT_ENDED)

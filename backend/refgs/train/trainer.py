@@ -2,30 +2,68 @@
 
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from refgs.capture import Capture, release_memory
-from refgs.compare.metrics import decibels
 from refgs.events import Report
 from refgs.memory import trim
+from refgs.run_folder import CHECKPOINTS
 from refgs.settings import Settings
-from refgs.train.decide import needs
+from refgs.train.decide import needs, photos
 from refgs.train.effective import Effective
 from refgs.train.keep import checkpoint, history, snapshot
 from refgs.train.keep.measures import Measures
-from refgs.train.learn import coarse, densify, exposures, light, poses, priors
-from refgs.train.learn.guard import Guard, running, warn
+from refgs.train.keep.progress import Means
+from refgs.train.learn import coarse, densify, exposures, light, poses, priors, trace
+from refgs.train.learn.guard import Guard, warn
 from refgs.train.learn.losses import departure, objective
 from refgs.train.learn.rates import set_rates
-from refgs.train.learn.trace import trace_due
 from refgs.train.material import even_metal, metals
 from refgs.train.plan import Plan, growth
-from refgs.train.setup import set_up, start_deferred
+from refgs.train.setup import set_up, start_deferred, start_residual
+from refgs.train.state import State
+from refgs.train.timeline import AFTER, BEFORE, CHECKPOINT, PLAN, RECORD, REPORT, WHOLE, Row, Step
 
-REPORT_EVERY = 10  # iterations
+ACTIONS: dict[str, Callable[[State, Step], None]] = {
+    "take larger photos": coarse.refine,
+    "start the deferred stage": start_deferred,
+    "start the residual": start_residual,
+    "set the rates": set_rates,
+    "refine the light": light.refine,
+    "refine the view's pose": poses.refine,
+    "remove the poses' common motion": poses.remove_common,
+    "diffuse the light": light.diffuse,
+    "balance the exposures": exposures.balance,
+    "make a mesh": trace.make_mesh,
+    "decide on inter-reflection": needs.reflections,
+    "trace what surfels receive": trace.trace_received,
+    "time the crops": photos.time_crops,
+    "look at a matte scene again": needs.look_again,
+    "decide on specular shading": needs.specular,
+    "decide on the light's texels": needs.light,
+    "decide on degrees of harmonics": needs.degrees,
+    "find metals": metals.find_metals,
+    "judge metals": metals.judge,
+    "even coloured metal out": even_metal.even_out,
+    "prune and divide surfels": densify.prune_and_divide,
+    "propagate normals": densify.propagate_normals,
+    "reset opacities": densify.reset_opacity,
+    "leave out exposures that agree": exposures.leave_out_alike,
+    "judge the poses": poses.judge,
+}
+"""What is done in the rows of BEFORE and AFTER."""
+
+
+def walk(rows: tuple[Row, ...], state: State, step: Step) -> None:
+    """Do what is due of the rows of a timeline, in their order."""
+    for row in rows:
+        if row.due(state, step):
+            with state.clock.part(row.clock) if row.clock else nullcontext():
+                ACTIONS[row.what](state, step)
 
 
 class Trainer:
@@ -52,45 +90,32 @@ class Trainer:
 
         On a graphics card, this returns before the tensors are computed. Reading their values waits for the card.
         """
-        state, view = self.state, self._next_view()
-        progress = min(state.iteration / state.total, 1.0)
-        coarse.refine_due(state, progress)
-        photo = state.photo(view, whole=state.iteration % needs.WHOLE_EVERY == 0, reduced=True)
-        if state.initial and progress >= state.settings.initial.until:
-            start_deferred(state)
-        set_rates(state, progress)
-        light.refine_due(state, progress)
+        state = self.state
+        step = Step(state, self._next_view())
+        walk(BEFORE, state, step)
+        figures = self._learn(step)
+        step.done += 1
+        walk(AFTER, state, step)
+        state.iteration = step.done
+        return figures
 
-        inputs = state.inputs()
-        rendering = state.picture(inputs, photo.camera, state.exposure(view))
+    def _learn(self, step: Step) -> dict[str, Tensor]:
+        """Render the photo, and take a step of Adam towards it. Returns what `step` returns."""
+        state = self.state
+        inputs, step.photo = state.inputs(), coarse.photo(state, step.view, WHOLE.due(state, step))
+        step.rendering = state.picture(inputs, step.photo.camera, exposures.exposure(state, step.view))
         mean = light.mean_radiance(state, inputs.environment)
-        loss, square = objective(rendering, mean, photo, state.background, state.losses, progress)
+        loss, square = objective(step.rendering, mean, step.photo, state.background, state.losses, step.progress)
         if "exposure" in state.learned:
-            loss = loss + state.settings.loss.exposure * departure(state.learned["exposure"][view])
-        if (leaning := priors.loss(state, view, rendering, photo, progress)) is not None:
+            loss = loss + state.settings.loss.exposure * departure(state.learned["exposure"][step.view])
+        if (leaning := priors.loss(state, step)) is not None:
             loss = loss + leaning
         loss.backward()
         metals.hold(state)
-        accepted, position = self.guard.judge(loss, state.learned), state.learned["position"]
-        state.motion.add(position.detach(), position.grad, state.photos[view].camera, accepted)
+        accepted = self.guard.judge(loss, state.learned)
+        densify.watch(state, step, accepted)
         state.learned.step(accepted)
-        poses.refine_due(state, view, rendering, photo, progress)
-        if inputs.environment is not None:
-            light.diffuse(state)
-        exposures.balance(state)
         state.learned.forget_gradients()
-        state.iteration += 1
-
-        trace_due(state, progress)  # meshes and decisions come before an opacity reset makes all surfels faint
-        with state.clock.part("deciding"):
-            needs.evaluate_iteration(state, progress)
-            metals.set_metals_due(state, progress)
-            metals.judge_due(state, progress)
-        even_metal.even_out_due(state, progress)
-        densify.densify_due(state, progress)
-        densify.reshape_due(state)
-        exposures.leave_out_alike(state, progress)
-        poses.put_back_if_worse(state, progress)
         return {"loss": loss.detach(), "square": square}
 
     def _next_view(self) -> int:
@@ -109,38 +134,37 @@ class Trainer:
 
         A checkpoint is written in both cases.
         """
-        state, means = self.state, {}
+        state, means = self.state, self.state.part(Means)
         before, first = state.seconds, state.iteration
         more = growth(state.learned.count, state.settings.surfels.budget)
-        state.plan.begin(state.iteration, more, state.stages)
+        state.plan.begin(state.iteration, more, state.part(coarse.Coarse).stages)
         while not state.ended and not self._should_stop(stop):
-            figures = self.iterate()
-            state.total = state.plan.total(state.iteration, len(state.views) + len(state.test)) or state.total
-            # Running means, read now and then: a card need not wait.
-            means = {name: running(means.get(name, figure), figure) for name, figure in figures.items()}
-            if state.iteration % REPORT_EVERY == 0 or state.iteration == state.total:
+            means.add(self.iterate())  # read now and then: a card need not wait
+            now = Step(state)
+            if PLAN.due(state, now):
+                state.total = state.plan.total(state.iteration, len(state.views) + len(state.test)) or state.total
+            if REPORT.due(state, now) or state.ended:
                 release_memory([*state.views, *state.test])
                 self._check(whole=state.ended)
-                pace = (state.seconds - before) / max(state.cost(first, state.iteration), 1e-9)  # it may have gone back
-                self._report_progress(means, pace)
-            if history.due(state.iteration) and not state.ended:
-                self._record(means)
-            if state.iteration % state.settings.train.checkpoint_every == 0 and not state.ended:
+                # It may have gone back.
+                pace = (state.seconds - before) / max(coarse.cost(state, first, state.iteration), 1e-9)
+                self._report_progress(pace)
+            now = Step(state)
+            if RECORD.due(state, now):
+                history.record(state, self.measures)
+            if CHECKPOINT.due(state, now):
                 self.save()
-        if state.ended and means:
-            self._record(means)
+        if state.ended and means.values:
+            history.record(state, self.measures)
         self.save()
         return state.ended
 
-    def _report_progress(self, means: dict[str, Tensor], pace: float) -> None:
-        state = self.state
+    def _report_progress(self, pace: float) -> None:
+        state, means = self.state, self.state.part(Means)
         facts = {"iteration": state.iteration, "total": state.total, "seconds": state.seconds}
-        facts |= {"seconds_left": pace * state.cost(state.iteration, state.total), "loss": float(means["loss"])}
-        facts |= {"psnr": decibels(float(means["square"])), "splats": state.learned.count}
+        facts |= {"seconds_left": pace * coarse.cost(state, state.iteration, state.total), "loss": means.loss}
+        facts |= {"psnr": means.psnr, "splats": state.learned.count}
         state.report("progress", facts)
-
-    def _record(self, means: dict[str, Tensor]) -> None:
-        history.record(self.state, self.measures, float(means["loss"]), decibels(float(means["square"])))
 
     def _should_stop(self, stop: Callable[[], bool]) -> bool:
         """Call `stop` and return its answer.
@@ -163,7 +187,7 @@ class Trainer:
             densify.fewer_surfels(self.state)
             figures = self._try_step()
         self.state.seconds += time.perf_counter() - begun
-        self.state.processor_seconds += time.process_time() - used
+        self.state.clock.processor += time.process_time() - used
         return figures
 
     def _try_step(self) -> dict[str, Tensor] | None:
@@ -187,7 +211,7 @@ class Trainer:
         `whole` is passed on to `Guard.look`. The lost time still counts as training time.
         """
         state = self.state
-        if why := self.guard.look(state, whole):
+        if why := self.guard.look(state, whole, lambda: checkpoint.complete(state.folder / CHECKPOINTS)):
             spent = state.seconds, dict(state.clock.seconds), state.plan.before
             self.resume()
             state.seconds, state.clock.seconds, state.plan.before = spent
@@ -195,7 +219,8 @@ class Trainer:
 
     def release_photos(self) -> None:
         """Drop all photos, when the training has ended: the files that they are mapped from can then be removed, on Windows, too."""
-        self.state.views, self.state.photos, self.state.test, self.state.reduced = [], [], [], None
+        self.state.views, self.state.photos, self.state.test = [], [], []
+        self.state.part(coarse.Coarse).photos = []
         del self.measures
 
     def resume(self) -> None:

@@ -6,6 +6,7 @@ The first stage shades each surfel, before blending. The second stage shades eac
 from typing import Any
 
 from refgs.train.decide.need import ASKED, Decision, Moment, Need
+from refgs.train.learn.coarse import cost
 from refgs.train.state import State
 
 
@@ -15,7 +16,7 @@ class Initial(Need):
     name, what = "initial", "a first stage of surfels shaded one by one"
     moments = ("start",)
 
-    def due(self, state: State, moment: Moment, progress: float) -> bool:
+    def due(self, state: State, moment: Moment) -> bool:
         # From the hull, deferred shading finds better normals alone than after this stage: docs/notebook/ablations.md.
         left_out = state.from_hull or self.asked(state) == "off"
         return left_out and state.settings.initial.until > 0 and state.method.deferred
@@ -38,17 +39,17 @@ class Iterations(Need):
     moments, follows = ("start",), "specular"
     ENOUGH = 0.8  # part of the iterations left after which matte scenes are as good as after all: docs/notebook/needs-and-minutes.md
 
-    def due(self, state: State, moment: Moment, progress: float) -> bool:
+    def due(self, state: State, moment: Moment) -> bool:
         matte = not state.needs.get("specular", {"needed": True})["needed"]
         asked = moment == "start" and self.asked(state) == "off"
         return (asked or matte) and state.plan.minutes is None
 
-    def measure(self, state: State) -> Decision:
+    def measure(self, state: State, done: int = 0) -> Decision:
         specular = state.needs.get("specular", {})
-        total = state.iteration + round(self.ENOUGH * (state.total - state.iteration))
+        total = done + round(self.ENOUGH * (state.total - done))
         left, why = 0.0, ASKED  # seconds
         if "statistic" in specular:
-            to_come = state.cost(state.iteration, state.total) / max(state.cost(0, state.iteration), 1e-9)
+            to_come = cost(state, done, state.total) / max(cost(state, 0, done), 1e-9)
             left = state.seconds * to_come - specular["seconds"]
             why = "what mirrors nothing has less to learn"
         figures = {"total": total, "seconds": max(left, 0.0) * (1 - self.ENOUGH)}

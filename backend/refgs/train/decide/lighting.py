@@ -26,7 +26,7 @@ class Reflections(Need):
     HOLLOW = 0.3
     SMALL_PART = 3.0  # dB of a small part (`probe.PART`); a black dielectric of roughness 0.5 has 2.4, a chrome bell 6, a mirror 20
 
-    def due(self, state: State, moment: Moment, progress: float) -> bool:
+    def due(self, state: State, moment: Moment) -> bool:
         return moment == "mesh" or self.asked(state) == "off"
 
     @torch.no_grad()
@@ -76,13 +76,12 @@ class Light(Need):
 
     name, what = "light", "all of the light's texels"
     threshold, reason = 0.01, "dB; a coarser light that costs more is not taken, whatever the roughness"
-    moments, follows = ("iteration",), "specular"
-    SETTLED = 0.19  # part of the training after which roughness hardly changes; before the light has all its texels
+    moments, follows = ("light",), "specular"
     GLOSSIEST = probe.PART / 2  # part of the picture that may be glossier than the roughness that texels are chosen for
     LOBE = 0.5  # part of a lobe's width that a texel may take
 
-    def due(self, state: State, moment: Moment, progress: float) -> bool:
-        return progress - state.settings.initial.until >= self.SETTLED
+    def due(self, state: State, moment: Moment) -> bool:
+        return moment == "light"
 
     @torch.no_grad()
     def measure(self, state: State) -> Decision:
@@ -142,12 +141,7 @@ class Degrees(Need):
 
     name, what = "degrees", "all degrees of harmonics"
     threshold, reason = 0.01, "dB of the training views: nobody sees it"
-    moments = ("iteration",)
-    LEARNED = 0.7  # part of the time in which harmonics learn after which it is known which degrees do
-
-    def due(self, state: State, moment: Moment, progress: float) -> bool:
-        late = state.residual_start
-        return late < 1 and progress >= late + self.LEARNED * (1 - late)
+    moments = ("degrees",)
 
     @torch.no_grad()
     def measure(self, state: State) -> Decision:

@@ -11,9 +11,7 @@ from refgs.train.decide.need import ASKED, MEGA, Decision, Moment, Need, megabyt
 from refgs.train.material import changes, metals
 from refgs.train.start import start_appearance
 from refgs.train.state import RenderInputs, State, why_not_traced
-from refgs.train.timeline import SOONEST
 
-KNOWN = 0.05  # part of the training after which it is known what mirrors: materials learn faster than shapes
 CHANGES = 0.042  # of 1; matte clay has 0.037, an embossed gold cape in flat light 0.056, a mirror 0.2
 SMALL_PART = 1.0  # dB of a small part (`probe.PART`); matte clay has -1.2, a clay pig with a chrome bell 1.7
 RARE = 1e-3  # part of the pictures, at either end, whose surfels do not count for a common value
@@ -28,17 +26,13 @@ class Specular(Need):
     reason = (
         "at a twentieth of a training matte clay has none; a polished plate has 0.8 dB, glossy paint 2.6, a mirror 5.6"
     )
-    moments = ("start", "iteration")
+    moments = ("start", "specular")
 
-    def due(self, state: State, moment: Moment, progress: float) -> bool:
-        settings = state.settings
-        if settings.render.reflection != "microfacet":
-            return False
-        if moment == "start":
-            return self.asked(state) == "off"
-        return progress - settings.initial.until >= KNOWN and state.iteration >= SOONEST
+    def due(self, state: State, moment: Moment) -> bool:
+        mirrors = state.settings.render.reflection == "microfacet"
+        return mirrors and (moment == "specular" or self.asked(state) == "off")
 
-    def measure(self, state: State) -> Decision:
+    def measure(self, state: State, done: int = 0) -> Decision:
         if self.asked(state) == "off":
             return Decision(False, ASKED)
         explained = probe.specular_explains(state)
@@ -67,8 +61,7 @@ class Specular(Need):
     def undo(self, state: State, why: str) -> None:
         state.change("render.reflection", state.effective.asked.render.reflection, "needs", why)
         _learn_again(state, ["metallic", "roughness", *(() if why_not_traced(state) else INDIRECT)])
-        metals.hold_none(state)
-        state.metals_set = False
+        state.part(metals.Metals).start(state)
 
     def look_again(self, state: State) -> Decision | None:
         """Look at a matte scene once more, halfway through the training: by then the surfels lie on the surface.
@@ -76,7 +69,7 @@ class Specular(Need):
         Returns the decision to bring specular shading back if colours change with the view after all.
         """
         found = state.needs.get(self.name, {"needed": True})
-        if found["needed"] or "statistic" not in found or "again" in found or 2 * state.iteration < state.total:
+        if found["needed"] or "statistic" not in found or "again" in found:
             return None
         change = found["again"] = changes.change_seen(changes.observe(state), state.wanted())
         why = f"halfway, colours change with the view by {change:.3f} of 1: it was taken for matte before"

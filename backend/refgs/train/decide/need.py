@@ -6,8 +6,8 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 from refgs.train.state import State
 
-Moment = Literal["photos", "start", "iteration", "mesh", "asset"]
-"""When needs are decided: the photos are read, parameters are ready, an iteration is done, a mesh is made, the asset is written."""
+Moment = Literal["photos", "start", "specular", "light", "degrees", "mesh", "asset"]
+"""When needs are decided: photos are read, parameters are ready, the need's row in the timeline, a mesh is made, the asset is written."""
 
 ASKED = "its setting leaves it out"
 NUMBER = 4 * 4  # bytes: a float, its derivative and Adam's two moments
@@ -45,7 +45,7 @@ class Need:
     moments: ClassVar[tuple[Moment, ...]]
     follows: ClassVar[str] = ""  # a need after whose decision this one is asked, too, and with which it is taken back
 
-    def due(self, state: State, moment: Moment, progress: float) -> bool:
+    def due(self, state: State, moment: Moment) -> bool:
         """Tell whether to decide about this optional part now, at this moment of the training.
 
         This method is not called if the user's setting is "on", or if the decision has already been made.

@@ -13,10 +13,10 @@ from refgs.train.decide.iterations import Initial, Iterations
 from refgs.train.decide.lighting import Degrees, Light, Reflections, share_hidden
 from refgs.train.decide.materials import Constants, Specular
 from refgs.train.decide.need import Decision, Moment, Need
-from refgs.train.decide.photos import WHOLE_EVERY, Outside, Views, time_crops
+from refgs.train.decide.photos import Outside, Views
 from refgs.train.decide.pictures import write_pictures
 from refgs.train.state import State
-from refgs.train.timeline import decidable
+from refgs.train.timeline import Step
 
 CONSTANTS, SPECULAR = Constants(), Specular()
 NEEDS: tuple[Need, ...] = (
@@ -38,42 +38,50 @@ __all__ = [
     "BY_NAME",
     "CONSTANTS",
     "NEEDS",
-    "WHOLE_EVERY",
     "bring_back_specular",
-    "evaluate_due",
-    "evaluate_iteration",
-    "evaluate_mesh",
+    "degrees",
+    "evaluate",
+    "light",
+    "look_again",
+    "reflections",
     "restore",
     "rows",
+    "specular",
 ]
 
 
-def evaluate_due(state: State, moment: Moment, *given: Any, progress: float = 0.0) -> list[str]:
+def evaluate(state: State, moment: Moment, *given: Any) -> list[str]:
     """Decide about the optional parts of the training (needs) that are due at a `moment`, such as "start" or "mesh".
 
-    Returns the names of the needs decided. `given` are measured values, passed on to `Need.measure`. `progress` is 0 at the start of the
-    training and 1 at its end.
+    Returns the names of the needs decided. `given` are measured values, passed on to `Need.measure`.
     """
     decided: list[str] = []
     for need in NEEDS:
         asked = moment in need.moments or need.follows in decided
         if not asked or need.name in state.needs or need.asked(state) == "on":
             continue
-        if need.due(state, moment, progress) and (decision := need.measure(state, *given)):
+        if need.due(state, moment) and (decision := need.measure(state, *given)):
             _record(state, need, decision)
             decided.append(need.name)
     return decided
 
 
-def evaluate_iteration(state: State, progress: float) -> None:
-    """After an iteration, decide about the optional parts of the training (needs) that are due."""
-    if decidable(state):
-        time_crops(state)
-        _look_again(state)
-        evaluate_due(state, "iteration", progress=progress)
+def specular(state: State, step: Step) -> None:
+    """Decide whether the scene needs specular shading, and what follows from that."""
+    evaluate(state, "specular", step.done)
 
 
-def _look_again(state: State) -> None:
+def light(state: State, step: Step) -> None:
+    """Decide whether the scene needs all of the light's texels."""
+    evaluate(state, "light")
+
+
+def degrees(state: State, step: Step) -> None:
+    """Decide whether the scene needs all degrees of harmonics."""
+    evaluate(state, "degrees")
+
+
+def look_again(state: State, step: Step) -> None:
     """Bring specular shading back if it is found halfway that a scene is not matte, and all that was left out with it."""
     if decision := SPECULAR.look_again(state):
         _bring_back_specular(state, decision)
@@ -102,14 +110,10 @@ def _undo_following(state: State, decisions: dict[str, dict[str, Any]], why: str
             need.undo(state, why)
 
 
-def evaluate_mesh(state: State, hidden: float) -> None:
-    """Decide whether the scene needs inter-reflection. Called each time that the training has extracted a mesh.
-
-    `hidden` is the fraction of the object's pixels that mirror the object itself. Once the decision has been made, this fraction is only
-    reported.
-    """
-    if not evaluate_due(state, "mesh", hidden):
-        state.announce("reflections", f"with {Reflections.what}: {share_hidden(hidden)}")
+def reflections(state: State, step: Step) -> None:
+    """Decide by a new mesh whether the scene needs inter-reflection. Once this is decided, only report how much mirrors itself."""
+    if not evaluate(state, "mesh", step.hidden):
+        state.announce("reflections", f"with {Reflections.what}: {share_hidden(step.hidden)}")
 
 
 def _record(state: State, need: Need, decision: Decision) -> None:

@@ -10,9 +10,8 @@ from refgs.train import probe
 from refgs.train.decide.need import MEGA, Decision, Moment, Need
 from refgs.train.photo import MARGIN, bounds
 from refgs.train.state import State
+from refgs.train.timeline import WHOLE_EVERY, Step
 
-WHOLE_EVERY = 8  # iterations: one of these sees its whole photo, so that nothing stays beyond the margin
-TIMED = 100  # iterations after which the time that crops save is measured
 ALIKE_PIXELS, ALIKE_DECIBELS = 0.5, 40.0  # duplicates move by less, and differ by no more than 8-bit photos' noise
 
 
@@ -44,7 +43,7 @@ class Outside(Need):
     threshold, reason = 0.1, "a part of the pixels; the time that less saves could not be measured"
     moments = ("start",)
 
-    def due(self, state: State, moment: Moment, progress: float) -> bool:
+    def due(self, state: State, moment: Moment) -> bool:
         return state.from_hull and state.settings.loss.alpha > 0
 
     def measure(self, state: State) -> Decision | None:
@@ -61,12 +60,12 @@ class Outside(Need):
         return Decision(False, f"{beyond}; one photo in {WHOLE_EVERY} is whole", statistic=part, once=crop)
 
 
-def time_crops(state: State) -> None:
+def time_crops(state: State, step: Step) -> None:
     """Measure how many seconds training on cropped photos saves. Add the result to the recorded decision to crop them (see `Outside`).
 
-    This is done once, as soon as there are enough iterations to measure.
+    This is done once.
     """
-    if state.crops is not None and state.iteration >= TIMED and "seconds" not in state.needs["outside"]:
+    if state.crops is not None and "seconds" not in state.needs["outside"]:
         state.needs["outside"]["seconds"] = (1 - 1 / WHOLE_EVERY) * probe.seconds_saved(state, whole=True)
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from refgs.compare.pictures import composite
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
+from refgs.train.learn.exposures import exposure
 from refgs.train.state import RenderInputs, State
 
 VIEWS = 6  # at the most
@@ -128,4 +129,4 @@ def _pictures(state: State, scene: Explanation, chosen: range) -> Iterator[Tenso
     light = Environment(scene[1].contiguous(), state.environment().reference)
     inputs = RenderInputs(scene[0], light, state.settings.render, state.occluder)
     for view in chosen:
-        yield state.picture(inputs, state.views[view].camera, state.exposure(view)).color.clamp(0, 1)
+        yield state.picture(inputs, state.views[view].camera, exposure(state, view)).color.clamp(0, 1)

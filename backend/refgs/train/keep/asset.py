@@ -23,6 +23,8 @@ from refgs.run import OCCLUDER
 from refgs.run_folder import SPLATS, update_metrics
 from refgs.train.decide import needs
 from refgs.train.learn import poses
+from refgs.train.learn.exposures import exposure
+from refgs.train.learn.poses import Poses
 from refgs.train.material import metals
 from refgs.train.probe import blended_shares
 from refgs.train.state import State, why_not_traced
@@ -68,15 +70,13 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
         update_metrics(folder, {"doubt": facts})
     splats.normals *= side[kept].numpy(force=True)[:, None]
     splats.normals = blended_normals(splats)
-    exposed = "exposure" in state.learned
-    if exposed or state.poses is not None:
+    factors = exposure(state, slice(None))
+    refined = state.part(Poses).values is not None
+    if factors is not None or refined:
         exposures = None
-        if exposed:
-            factors = state.exposure(slice(None)).tolist()
-            exposures = {view.camera.name: factor for view, factor in zip(state.views, factors, strict=True)}
-        write_cameras(
-            folder / "cameras.json", poses.refined(state), settings.light.frame, exposures, state.poses is not None
-        )
+        if factors is not None:
+            exposures = {view.camera.name: factor for view, factor in zip(state.views, factors.tolist(), strict=True)}
+        write_cameras(folder / "cameras.json", poses.refined(state), settings.light.frame, exposures, refined)
     write_text(folder / "needs.json", json.dumps(_needs_rows(state, surfels, side, wanted), indent=1))
     before_splats()
     write_splats(folder / SPLATS, splats)
@@ -90,7 +90,7 @@ def _constant_columns(state: State, surfels: Surfels, kept: Tensor) -> dict[str,
     if state.settings.render.reflection == "none" and state.method.lit:
         return {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
     common = needs.CONSTANTS.common(state, surfels, kept)
-    needs.evaluate_due(state, "asset", common, int(kept.sum()))
+    needs.evaluate(state, "asset", common, int(kept.sum()))
     return {name: value for name, (value, _) in common.items()}
 
 

@@ -10,21 +10,12 @@ from refgs.formats.history import FILE, damage, read
 from refgs.paths import write_text
 from refgs.train.keep.checkpoint import DAMAGED, set_aside
 from refgs.train.keep.measures import Measures
+from refgs.train.keep.progress import Means
 from refgs.train.state import State
+from refgs.train.timeline import FIRST_LINE
 
-FIRST = 10  # iterations before the first line
-A_DECADE = 10  # lines while iterations grow tenfold: evenly spaced where both axes of a chart are logarithms
 SHARE = 0.025  # of the training's time that measuring may take; FLIP, as dear as all else, may take as much again
 BESIDE = ("reading", "start", "writing", "measuring", "FLIP")  # parts of the clock that are not in a training's seconds
-
-
-def due(iteration: int) -> bool:
-    """Tell whether the history should have a line for this iteration.
-
-    Lines are evenly spaced on a logarithmic axis: A_DECADE lines from iteration 10 to 100, as many from 100 to 1000, and so on.
-    """
-    place, before = (math.floor(A_DECADE * math.log10(max(i, 1))) for i in (iteration, iteration - 1))
-    return iteration >= FIRST and place > before
 
 
 def allowed(iteration: int, total: int, seconds: float) -> float:
@@ -37,25 +28,26 @@ def allowed(iteration: int, total: int, seconds: float) -> float:
     iteration, because errors are measured at iterations that are evenly spaced by logarithm. The time for the image error FLIP is counted
     separately, and compared with the same limit.
     """
-    lines = math.log(max(total / FIRST, 1)) or 1.0
-    passed = min(math.log(max(iteration / FIRST, 1)) / lines, 1.0)
+    lines = math.log(max(total / FIRST_LINE, 1)) or 1.0
+    passed = min(math.log(max(iteration / FIRST_LINE, 1)) / lines, 1.0)
     return SHARE * passed * seconds * total / iteration
 
 
-def record(state: State, measures: Measures, loss: float, quality: float) -> None:
+def record(state: State, measures: Measures) -> None:
     """Add a line to the history that describes the training now.
 
-    `loss` is the running mean of the training loss, and `quality` is that of the PSNR on training views. Errors against held-out photos and
+    Errors against held-out photos and
     ground truth are measured if there is time for it (see `allowed`).
     """
+    means = state.part(Means)
     limit = math.inf if state.ended else allowed(state.iteration, state.total, state.seconds)
     parts = dict(state.clock.seconds)
     parts["other"] = state.seconds - sum(value for name, value in parts.items() if name not in BESIDE)
     facts = {
         "iteration": state.iteration,
         "seconds": round(state.seconds, 3),
-        "loss": loss,
-        "psnr_train": quality,
+        "loss": means.loss,
+        "psnr_train": means.psnr,
         "splats": state.learned.count,
     }
     for part, measure in (("measuring", measures.errors), ("FLIP", measures.flip)):

@@ -2,36 +2,25 @@
 
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from refgs.errors import InputError
 from refgs.formats.checkpoint import Facts
-from refgs.formats.mesh import Mesh
 from refgs.formats.validate import validated
-from refgs.geometry.visibility import Occluder
 from refgs.train.decide import needs
 from refgs.train.keep import checkpoint
-from refgs.train.learn import coarse, poses
-from refgs.train.state import State, why_not_traced
+from refgs.train.state import State
 
 
 def save(state: State) -> None:
     """Write a checkpoint into the run folder."""
     tensors = state.learned.save()
-    tensors |= {"motion.total": state.motion.total, "motion.views": state.motion.views}
-    if state.poses is not None:
-        tensors |= {"poses": state.poses}
-    if state.light_shown is not None:
-        tensors |= {"mirrored": state.light_shown}
-    if state.occluder is not None:
-        mesh = state.occluder.mesh
-        tensors |= {"occluder.vertices": torch.from_numpy(mesh.vertices)}
-        tensors |= {"occluder.faces": torch.from_numpy(mesh.faces.astype(np.int32))}
-    facts = {"seconds": state.seconds, "total": state.total, "initial": state.initial, "decided": state.decided}
-    facts |= {"parts": state.clock.seconds, "spent": state.plan.spent}
-    facts |= {"processor_seconds": state.processor_seconds, "needs": state.needs, "metals_set": state.metals_set}
-    facts |= {"poses_judged": state.poses_judged, "reduced": state.reduced.factor if state.reduced else 1}
+    for part in state.parts.values():
+        tensors |= {f"{part.name}.{name}": value for name, value in part.tensors(state).items()}
+    facts = {"seconds": state.seconds, "total": state.total, "initial": state.initial, "residual": state.residual}
+    facts |= {"clock": state.clock.seconds, "spent": state.plan.spent, "processor_seconds": state.clock.processor}
+    facts |= {"decided": state.decided, "needs": state.needs}
+    facts["parts"] = {part.name: found for part in state.parts.values() if (found := part.facts(state))}
     checkpoint.save(state.folder / "checkpoints", state.iteration, tensors, facts)
 
 
@@ -45,36 +34,30 @@ def restore(state: State, run: Path) -> None:
     _check_tensors(tensors, run)
     state.total = facts.total
     needs.restore(state, {name: found.model_dump(exclude_unset=True) for name, found in facts.needs.items()})
-    mesh = {name: tensors.pop(name).numpy() for name in list(tensors) if name.startswith("occluder.")}
     tensors = {name: value.to(state.device) for name, value in tensors.items()}
-    try:
-        state.learned.load(tensors)
-    except KeyError:
-        raise InputError(f"{run} was begun by another release of RefGS: train again into a new folder") from None
     state.iteration, state.seconds = facts.iteration, facts.seconds
-    state.clock.resume(facts.parts)
-    state.plan.before = state.seconds if facts.spent is None else facts.spent
-    state.processor_seconds = facts.processor_seconds
-    state.initial = state.initial if facts.initial is None else facts.initial
-    state.metals_set, state.poses_judged = facts.metals_set, facts.poses_judged
+    state.clock.resume(facts.clock, facts.processor_seconds)
+    state.plan.before = facts.spent
+    state.initial, state.residual = facts.initial, facts.residual
     for about, what in facts.decided.items():
         state.announce(about, what)
-    state.motion.total, state.motion.views = tensors["motion.total"], tensors["motion.views"]
-    state.light_shown = tensors.get("mirrored")
-    poses.restore(state, tensors["poses"].cpu() if "poses" in tensors else None)
-    coarse.set_factor(state, facts.reduced)
-    state.occluder = None
-    if mesh and not why_not_traced(state):
-        state.occluder = Occluder(Mesh(mesh["occluder.vertices"], mesh["occluder.faces"]))
+    try:
+        state.learned.load(tensors)
+        for part in state.parts.values():
+            prefix = f"{part.name}."
+            own = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+            part.restore(state, facts.parts.get(part.name, {}), own)
+    except KeyError:
+        raise InputError(f"{run} was begun by another release of RefGS: train again into a new folder") from None
 
 
 def _check_tensors(tensors: dict[str, torch.Tensor], run: Path) -> None:
     """Raise InputError if tensors of a checkpoint are missing, or do not belong together: they have other rows or types."""
-    fine = {"environment", "motion.total", "motion.views", "parameter.position"} <= tensors.keys()
+    fine = {"environment", "parameter.position"} <= tensors.keys()
     rows = tensors["parameter.position"].shape[:1] if fine else ()
     for name, value in tensors.items():
         kind, _, rest = name.partition(".")
-        if kind in ("parameter", "constant", "motion"):
+        if kind in ("parameter", "constant", "densification"):
             fine &= value.shape[:1] == ((1,) if kind == "constant" else rows)
         if kind in ("parameter", "constant", "environment", "exposure"):
             fine &= value.dtype == (torch.bool if rest == "held" else torch.float32)

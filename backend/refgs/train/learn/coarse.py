@@ -3,30 +3,58 @@
 Small objects are trained on full photos from the start: of an object of 64 pixels, half the size loses 0.3 dB.
 """
 
+from collections.abc import Mapping
+
+from refgs.camera import Camera
 from refgs.capture import LoadedView, reduced_views
 from refgs.run_folder import PHOTOS
-from refgs.train.learn import poses
-from refgs.train.photo import MARGIN, Photo, bounds
-from refgs.train.plan import FULL, Stage
-from refgs.train.state import Reduced, State
+from refgs.train.part import Fact, Part
+from refgs.train.photo import MARGIN, Crop, Photo, bounds
+from refgs.train.plan import FULL, Stage, iterations_time, stage_at
+from refgs.train.state import State
+from refgs.train.timeline import POSES_KNOWN, Step
 
 STAGES = (0.35, 4), (0.7, 2)  # part of the training until which photos are reduced, and by what factor
-LEAST = 200  # pixels of the object in reduced photos
+LEAST_SPAN = 200  # pixels of the object in reduced photos
+
+
+class Coarse(Part):
+    """Remember the stages of the training by its photos' sizes, and the reduced photos of the stage that it is in.
+
+    `factor` is that by which the sides of `photos` are reduced, 1 for full photos. `crops` are the parts of `photos` that are trained on.
+    """
+
+    name = "coarse"
+
+    def __init__(self) -> None:
+        self.stages: tuple[Stage, ...] = FULL
+        self.factor = 1
+        self.photos: list[Photo] = []
+        self.crops: list[Crop] | None = None
+
+    def facts(self, state: State) -> dict[str, Fact]:
+        return {"factor": self.factor}
+
+    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping) -> None:
+        set_factor(state, int(facts.get("factor", 1)))
 
 
 def stages(pixels: float) -> tuple[Stage, ...]:
     """Plan the stages of a training of an object that spans so many `pixels` in the full photos."""
-    return *(Stage(*stage) for stage in STAGES if pixels / stage[1] >= LEAST), *FULL
+    return *(Stage(*stage) for stage in STAGES if pixels / stage[1] >= LEAST_SPAN), *FULL
 
 
-def begin(state: State, pixels: float) -> None:
-    """Choose the stages of a training of an object that spans so many `pixels` in the full photos, and start with the first one."""
+def begin(state: State, pixels: float, refined: bool) -> None:
+    """Choose the stages of a training of an object that spans so many `pixels` in the full photos, and start with the first one.
+
+    Poses that are `refined` take full photos from when they are judged on.
+    """
     if state.settings.image.coarse == "off":
         return
     found = stages(pixels)
-    if state.poses is not None:  # that they are refined takes full photos
-        found = *(stage for stage in found if stage.until <= poses.KNOWN), *FULL
-    state.stages = found
+    if refined:
+        found = *(stage for stage in found if stage.until <= POSES_KNOWN), *FULL
+    state.part(Coarse).stages = found
     if len(found) > 1:
         factor = found[0].factor
         what = f"photos are reduced by a factor of {factor} at first: the object spans {pixels:.0f} pixels"
@@ -34,27 +62,47 @@ def begin(state: State, pixels: float) -> None:
         set_factor(state, factor)
 
 
-def refine_due(state: State, progress: float) -> None:
+def refine(state: State, step: Step) -> None:
     """Take larger photos once their stage has come. They are never reduced again, even if the training gets longer."""
-    if state.reduced is not None:
-        factor = next(stage.factor for stage in state.stages if progress < stage.until or stage.until == 1)
-        if factor < state.reduced.factor:
-            set_factor(state, factor)
-            size = "in full size" if factor == 1 else f"reduced by a factor of {factor}"
-            state.report("stage", {"what": f"photos are {size} from now on"})
+    coarse = state.part(Coarse)
+    factor = stage_at(step.progress, coarse.stages).factor
+    if factor < coarse.factor:
+        set_factor(state, factor)
+        size = "in full size" if factor == 1 else f"reduced by a factor of {factor}"
+        state.report("stage", {"what": f"photos are {size} from now on"})
 
 
 def set_factor(state: State, factor: int) -> None:
     """Train on photos reduced by a factor, 1 for full photos."""
-    if factor == (1 if state.reduced is None else state.reduced.factor):
+    coarse = state.part(Coarse)
+    if factor == coarse.factor:
         return
-    state.reduced = None  # first, for its memory
+    coarse.photos, coarse.crops, coarse.factor = [], None, factor  # first, for their memory
     if factor > 1:
         with state.clock.part("reading"):
-            views = reduced_views(state.views, factor, state.folder / PHOTOS)
-            state.reduced = Reduced(factor, *_photos(state, views))
+            views: list[LoadedView] = reduced_views(state.views, factor, state.folder / PHOTOS)
+            coarse.photos = [Photo.of(view, state.device) for view in views]
+            coarse.crops = None if state.crops is None else [bounds(view.alpha, MARGIN) for view in views]
 
 
-def _photos(state: State, views: list[LoadedView]) -> tuple[list[Photo], list[tuple[slice, slice]] | None]:
-    photos = [Photo.of(view, state.device) for view in views]
-    return photos, None if state.crops is None else [bounds(view.alpha, MARGIN) for view in views]
+def photo(state: State, view: int, whole: bool) -> Photo:
+    """Return the crop of a view's photo in the size that is trained on now, or the whole photo if `whole` is true."""
+    coarse = state.part(Coarse)
+    if coarse.factor == 1:
+        return state.photo(view, whole)
+    return coarse.photos[view] if whole or coarse.crops is None else coarse.photos[view].part(*coarse.crops[view])
+
+
+def move_camera(state: State, view: int, camera: Camera) -> None:
+    """Replace the camera of a training view's reduced photo. `camera` is that of the full photo."""
+    coarse = state.part(Coarse)
+    if coarse.factor > 1:
+        small = coarse.photos[view]
+        coarse.photos[view] = small._replace(camera=camera.resized(small.camera.width, small.camera.height))
+
+
+def cost(state: State, first: int, last: int) -> float:
+    """Estimate how long the iterations from `first` to `last` take together, in iterations on full photos."""
+    stages = state.part(Coarse).stages
+    begun, ended = (iterations_time(1.0, k / state.total, stages) for k in (first, last))
+    return state.total * (ended - begun)

@@ -1,6 +1,7 @@
 """Divide surfels where the picture needs more detail, remove faint ones, reset opacities, propagate normals."""
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -8,21 +9,51 @@ from torch import Tensor
 from refgs.errors import TryAgain
 from refgs.model.learned import Learned
 from refgs.model.surfels import activate, axes
-from refgs.settings import DensifySettings, PropagationSettings
+from refgs.settings import DensifySettings
+from refgs.train.part import Fact, Part
+from refgs.train.screen_gradient import ScreenGradient
 from refgs.train.start import AROUND
 from refgs.train.state import State
-from refgs.train.timeline import RESET, faint_now, since_propagation
+from refgs.train.timeline import DIVIDE, RESET, Step
 
 FEWER = 0.8  # of the surfels, where there is no memory for all
 LEAST_SURFELS = 1000
 
 
-def densify_due(state: State, progress: float) -> None:
-    """Remove faint surfels and divide others, if this iteration is scheduled for it."""
+class Densification(Part):
+    """Remember the mean gradient of each surfel on the screen, which says which surfels to divide."""
+
+    name = "densification"
+
+    def __init__(self) -> None:
+        self.gradient = ScreenGradient(0, torch.device("cpu"))
+
+    def start(self, state: State) -> None:
+        self.restart(state)
+
+    def restart(self, state: State) -> None:
+        """Restart the mean, after surfels have been replaced."""
+        self.gradient = ScreenGradient(state.learned.count, state.device)
+
+    def tensors(self, state: State) -> dict[str, Tensor]:
+        return {"total": self.gradient.total, "views": self.gradient.views}
+
+    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping[str, Tensor]) -> None:
+        self.restart(state)
+        self.gradient.total, self.gradient.views = tensors["total"], tensors["views"]
+
+
+def watch(state: State, step: Step, accepted: Tensor) -> None:
+    """Add the view's gradients of the positions to their mean on the screen, if the step is `accepted`."""
+    position, gradient = state.learned["position"], state.part(Densification).gradient
+    if position.grad is not None:
+        gradient.add(position.detach(), position.grad, state.photos[step.view].camera, accepted)
+
+
+def prune_and_divide(state: State, step: Step) -> None:
+    """Remove faint surfels, and divide others unless it is too late for that."""
     settings, budget = state.settings.densify, state.settings.surfels.budget
-    if state.iteration % settings.every or progress < settings.start or faint_now(state, settings.prune_opacity):
-        return
-    gradient = state.motion.mean()
+    gradient = state.part(Densification).gradient.mean()
     if state.capture.box is not None:  # surfels beside the region get no more than their share of the budget
         wanted = state.wanted()
         ranked = torch.where(wanted, torch.inf, gradient).argsort(descending=True)
@@ -30,18 +61,8 @@ def densify_due(state: State, progress: float) -> None:
         room = max(int(AROUND * budget) - (len(wanted) - count), 0)
         gradient[ranked[count + room :]] = 0
     with state.clock.part("densification"):
-        densify(state.learned, gradient, settings, budget, divide=progress < settings.stop)
-    state.reset_motion()
-
-
-def reshape_due(state: State) -> None:
-    """Propagate normals or reset opacities, if this iteration is scheduled for it."""
-    settings, iteration = state.settings.densify, state.iteration
-    if since_propagation(state) == 0:
-        with state.clock.part("densification"):
-            propagate_normals(state.learned, state.settings.propagation)
-    elif settings.reset_every and iteration % settings.reset_every == 0 and iteration / state.total < settings.stop:
-        reset_opacity(state.learned)
+        densify(state.learned, gradient, settings, budget, divide=DIVIDE.due(state, step))
+    state.part(Densification).restart(state)
 
 
 @torch.no_grad()
@@ -73,21 +94,22 @@ def densify(learned: Learned, gradient: Tensor, settings: DensifySettings, budge
 
 
 @torch.no_grad()
-def reset_opacity(learned: Learned) -> None:
+def reset_opacity(state: State, step: Step) -> None:
     """Lower all opacities to RESET at most (Kerbl et al. 2023).
 
     Training then raises the opacities of the surfels that the picture needs. The other surfels stay faint and are removed later.
     """
-    learned.fill("opacity", learned["opacity"].clamp(max=math.log(RESET / (1 - RESET))))
+    state.learned.fill("opacity", state.learned["opacity"].clamp(max=math.log(RESET / (1 - RESET))))
 
 
 @torch.no_grad()
-def propagate_normals(learned: Learned, settings: PropagationSettings) -> None:
+def propagate_normals(state: State, step: Step) -> None:
     """Propagate normals from mirror-like surfels to the surfels around them (Ref-Gaussian paper, §3.3).
 
-    Smooth, metallic surfels are enlarged, and all opacities are raised to at least `settings.opacity`. The enlarged surfels then cover
+    Smooth, metallic surfels are enlarged, and all opacities are raised to at least `propagation.opacity`. The enlarged surfels then cover
     their neighbours' pixels, which are shaded with the enlarged surfels' normals. Further training adapts the neighbours to these normals.
     """
+    learned, settings = state.learned, state.settings.propagation
     learned.fill("opacity", learned["opacity"].clamp(min=math.log(settings.opacity / (1 - settings.opacity))))
     surfels = activate(learned.constant | learned.by_row)
     mirrors = (surfels.metallic >= settings.metallic) & (surfels.roughness <= settings.roughness)
@@ -117,7 +139,7 @@ def fewer_surfels(state: State) -> None:
     torch.cuda.empty_cache()
     state.change("surfels.budget", budget, "memory", "the card's memory is full")
     thin(state.learned, budget)
-    state.reset_motion()
+    state.part(Densification).restart(state)
     state.report("warning", {"what": f"the card's memory is full: going on with {budget:,} surfels at the most"})
 
 

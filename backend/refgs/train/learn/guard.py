@@ -1,11 +1,13 @@
 """Guard a training against NaN and infinity: skip and count the steps that have them, and remove the surfels that have them."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from refgs.errors import InputError
 from refgs.model.learned import Learned
-from refgs.train.keep import checkpoint
+from refgs.train.learn.densify import Densification
 from refgs.train.state import State
 
 MOST_IN_A_ROW = 30  # steps that may be left out before the training goes back
@@ -39,12 +41,14 @@ class Guard:
         """Return how many steps were skipped since this process started."""
         return int(self._counts[0])
 
-    def look(self, state: State, whole: bool) -> str:
+    def look(self, state: State, whole: bool, complete: Callable[[], list[int]]) -> str:
         """Look for numbers that are not finite: warn of skipped steps, and remove surfels that have such numbers.
 
-        Surfels are only checked if steps were skipped since the last call, or if `whole` is true. If the light is broken, or too many steps
-        in a row were skipped, the training must go back to its last checkpoint, and the reason is returned. Otherwise "" is returned.
-        Raises InputError if there is no checkpoint, or if the training failed again after it went back.
+        Surfels are only checked if steps were skipped since the last call, or if `whole` is true. `complete` lists
+        the iterations that have a complete checkpoint.
+
+        If the light is broken, or too many steps in a row were skipped, the training must go back to its last checkpoint, and the reason is
+        returned. Otherwise "" is returned. Raises InputError if there is no checkpoint, or if the training failed again after it went back.
         """
         total, in_a_row, taken = (int(count) for count in self._counts.tolist())
         worse, self._seen = total > self._seen, total
@@ -55,14 +59,13 @@ class Guard:
             warn(state, f"steps not taken so far, for the loss or a gradient was not finite: {total}")
         count = remove_broken(state.learned)
         if count:
-            state.reset_motion()
+            state.part(Densification).restart(state)
             warn(state, f"surfels removed, for they had numbers that are not finite: {count}")
         elsewhere = state.learned.keys() - state.learned.by_row.keys()
         lit = all(bool(state.learned[name].isfinite().all()) for name in elsewhere)
         if lit and (in_a_row < MOST_IN_A_ROW or count):
             return ""
-        kept = checkpoint.complete(state.folder / "checkpoints")
-        what = f"{in_a_row} steps in a row were not finite" if lit else "the light is not finite"
+        kept, what = complete(), f"{in_a_row} steps in a row were not finite" if lit else "the light is not finite"
         at = f"{what} at iteration {state.iteration}"
         advice = "train anew with lower rates (--set rates.…), or another seed (--set train.seed=1)"
         if not kept:
@@ -91,9 +94,3 @@ def remove_broken(learned: Learned) -> int:
     if count:
         learned.rows(whole.nonzero()[:, 0])
     return count
-
-
-def running(mean: Tensor, figure: Tensor) -> Tensor:
-    """Return the running mean after a new value, `figure`. If the value is not finite, return the mean unchanged."""
-    known = torch.where(mean.isfinite(), figure + 0.95 * (mean - figure), figure)
-    return torch.where(figure.isfinite(), known, mean)

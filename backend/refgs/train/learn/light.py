@@ -4,6 +4,7 @@ A term of the loss pulls this mean towards grey, so that the light does not take
 """
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -19,9 +20,10 @@ from refgs.render.shade import mirror_directions
 from refgs.render.stack import stack
 from refgs.render.volume import discs
 from refgs.settings import RenderSettings, Settings
+from refgs.train.part import Fact, Part
 from refgs.train.state import State
+from refgs.train.timeline import Step
 
-REFINED = 0.2  # part of the training after which the light has all its texels
 LEAST = 16  # texels along a side
 DIFFUSED = (
     64  # texels along a side at which `environment.diffusion` holds; it reaches as far on the sphere at other sides
@@ -31,26 +33,40 @@ PART = 16  # texels along a side of the cubemap that says which directions are m
 SOLID = 0.5  # alpha
 
 
+class MirroredLight(Part):
+    """Remember which part of the light the object mirrors towards the cameras: the `weight` of each texel in the light's mean."""
+
+    name = "light"
+
+    def __init__(self) -> None:
+        self.weight: Tensor | None = None
+
+    def tensors(self, state: State) -> dict[str, Tensor]:
+        return {} if self.weight is None else {"weight": self.weight}
+
+    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping[str, Tensor]) -> None:
+        self.weight = tensors.get("weight")
+
+
 def start_value(state: State) -> float:
     """Return the raw value, before activation, at which all texels of the light start."""
     return state.method.light.raw(state.settings.environment.radiance)
 
 
-def resolution(settings: Settings, progress: float) -> int:
-    """Return how many texels the cubemap has along a side, for a progress of 0..1.
+def first_resolution(settings: Settings) -> int:
+    """Return how many texels the cubemap has along a side at first.
 
-    Early in the training, the cubemap has half its final resolution: each texel is then seen more often and learns sooner.
+    It is half the final resolution: each texel is then seen more often and learns sooner.
     """
-    finest = settings.environment.resolution
-    return finest if progress >= REFINED else max(finest // 2, LEAST)
+    return max(settings.environment.resolution // 2, LEAST)
 
 
 @torch.no_grad()
-def refine_due(state: State, progress: float) -> None:
-    """Double the cubemap's texels along a side, once the training is far enough for it (see `resolution`)."""
-    if not state.method.lit or len(state.learned["environment"]) >= 6 * resolution(state.settings, progress) ** 2:
-        return
+def refine(state: State, step: Step) -> None:
+    """Double the cubemap's texels along a side, if it has fewer than in the settings."""
     side = math.isqrt(len(state.learned["environment"]) // 6)
+    if side >= state.settings.environment.resolution:
+        return
     directions = cubemap.texel_directions(2 * side).float()
     finer = cubemap.sample(state.learned["environment"].cpu(), (side,), directions, torch.zeros(len(directions)))
     state.learned.learn("environment", finer.to(state.device), by_row=False)
@@ -66,7 +82,7 @@ def coarsen(state: State, side: int) -> None:
 
 @timed("optimiser")
 @torch.no_grad()
-def diffuse(state: State) -> None:
+def diffuse(state: State, step: Step) -> None:
     """Smooth the light a little: let neighbouring texels of a cubemap face flow into each other, and let each texel fade to grey.
 
     How much they do is proportional to the light's learning rate. This is a step of its own beside the optimiser's, like decoupled weight
@@ -94,11 +110,12 @@ def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
     """
     if light is None or state.settings.loss.light == 0:
         return None
-    if state.light_shown is None or len(state.light_shown) != len(light.radiance):
+    mirrors = state.part(MirroredLight)
+    if mirrors.weight is None or len(mirrors.weight) != len(light.radiance):
         cameras = state.spread_cameras(VIEWS)
         with torch.no_grad():
-            state.light_shown = mirrored(state.surfels(), cameras, light, state.settings.render, state.near)
-    return state.light_shown @ light.radiance
+            mirrors.weight = mirrored(state.surfels(), cameras, light, state.settings.render, state.near)
+    return mirrors.weight @ light.radiance
 
 
 def mirrored(

@@ -7,82 +7,120 @@ Features that photos have in common tell whether poses need that, and whether it
 also move where a mirror's image, which is not at rest on the mirror, is not explained yet.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from refgs.camera import Camera
 from refgs.capture import Capture
 from refgs.capture.matches import match_neighbours, pixels_apart
 from refgs.render.align import REDUCTIONS, pose_step, posed
-from refgs.render.rendering import Rendering
-from refgs.train.photo import Photo
+from refgs.train.learn import coarse
+from refgs.train.part import Fact, Part
 from refgs.train.state import State
+from refgs.train.timeline import POSES_FROM, POSES_KNOWN, Step
 
-FROM, KNOWN, UNTIL = 0.05, 0.3, 2 / 3  # parts of the training: poses start to learn, are judged, and are frozen
 MOST = 0.02  # of a step: radians, and scene radii
 SAMPLE = 1000  # surfels whose shift in the photos is measured
 EXACT = 0.3  # pixels between features and their epipolar lines: poses with less are exact; four real captures have 0.1
 BETTER = 0.5  # of the given poses' distance, below which the refined ones must come
 
 
-def start(state: State) -> None:
-    """Give every view a pose, zero, if the setting `cameras.poses` is "on", or if it is "auto" and features contradict the given poses."""
-    wanted = state.settings.cameras.poses
-    if wanted == "auto":
-        with state.clock.part("start"):
-            apart = pixels_apart(match_neighbours(state.views), state.given)
-        wanted = "off" if apart is None or apart < EXACT else "on"
+class Poses(Part):
+    """Remember the poses of the views.
+
+    `given` are the views' cameras in the capture, and `values` (V, 6) the poses that move the scene before them; None if cameras are the
+    given ones. `judged` tells whether `judge` has compared both.
+    """
+
+    name = "poses"
+
+    def __init__(self) -> None:
+        self.given: list[Camera] = []
+        self.values: Tensor | None = None
+        self.judged = False
+
+    def start(self, state: State) -> None:
+        """Give every view a pose, zero, if the setting `cameras.poses` is "on", or "auto" and features contradict the given poses."""
+        self.given, wanted = [view.camera for view in state.views], state.settings.cameras.poses
+        if wanted == "auto":
+            with state.clock.part("start"):
+                apart = pixels_apart(match_neighbours(state.views), self.given)
+            wanted = "off" if apart is None or apart < EXACT else "on"
+            if wanted == "on":
+                state.announce("poses", f"the cameras' poses are refined: features are {apart:.1f} pixels off")
         if wanted == "on":
-            state.announce("poses", f"the cameras' poses are refined: features are {apart:.1f} pixels off")
-    if wanted == "on":
-        state.poses = torch.zeros(len(state.views), 6)
+            self.values = torch.zeros(len(state.views), 6)
+
+    def facts(self, state: State) -> dict[str, Fact]:
+        return {"judged": self.judged}
+
+    def tensors(self, state: State) -> dict[str, Tensor]:
+        return {} if self.values is None else {"values": self.values}
+
+    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping[str, Tensor]) -> None:
+        self.judged = bool(facts.get("judged", True))
+        values = tensors.get("values")
+        self.put(state, None if values is None else values.cpu())
+
+    def put(self, state: State, values: Tensor | None) -> None:
+        """Set the poses of all views, or None: then all cameras are the given ones."""
+        self.values = values
+        for view in range(len(state.views)):
+            self.move(state, view)
+
+    def move(self, state: State, view: int) -> None:
+        """Move a view's camera by its pose."""
+        camera = self.given[view]
+        if self.values is not None:
+            camera = posed(camera, self.values[view], state.capture.centre, state.capture.radius)
+        state.views[view] = replace(state.views[view], camera=camera)
+        state.photos[view] = state.photos[view]._replace(camera=camera)
+        coarse.move_camera(state, view, camera)
 
 
 @torch.no_grad()
-def refine_due(state: State, view: int, rendering: Rendering, photo: Photo, progress: float) -> None:
-    """Move the pose of a view towards its photo, if poses learn now. At the end of an epoch, remove the motion that all views share.
-
-    `rendering` is the picture of the `photo` of the view. A step that is not finite is ignored.
-    """
-    if state.poses is None or not FROM <= progress < UNTIL:
+def refine(state: State, step: Step) -> None:
+    """Move the pose of the view towards its photo. A step that is not finite is ignored."""
+    poses, photo = state.part(Poses), step.photo
+    if poses.values is None:
         return
     centre, radius = state.capture.centre, state.capture.radius
-    level = int((progress - FROM) / (KNOWN - FROM) * len(REDUCTIONS))
+    level = int((step.progress - POSES_FROM) / (POSES_KNOWN - POSES_FROM) * len(REDUCTIONS))
     reduction = REDUCTIONS[min(level, len(REDUCTIONS) - 1)]
-    reduction = max(reduction // (state.reduced.factor if state.reduced else 1), 1)  # the photo may be reduced already
-    step = pose_step(rendering, photo.over(state.background), photo.camera, centre, radius, reduction)
-    if step.isfinite().all():
-        state.poses[view] += step.clamp(-MOST, MOST)
-        _move(state, view)
-    if state.iteration % len(state.views) == len(state.views) - 1:
-        state.poses = _without_common(state)
-        for index in range(len(state.views)):
-            _move(state, index)
+    reduction = max(reduction // state.part(coarse.Coarse).factor, 1)  # the photo may be reduced already
+    found = pose_step(step.rendering, photo.over(state.background), photo.camera, centre, radius, reduction)
+    if found.isfinite().all():
+        poses.values[step.view] += found.clamp(-MOST, MOST)
+        poses.move(state, step.view)
 
 
-def restore(state: State, poses: Tensor | None) -> None:
-    """Set the poses of all views, or None: then all cameras are the capture's own."""
-    state.poses = poses
-    for index in range(len(state.views)):
-        _move(state, index)
+@torch.no_grad()
+def remove_common(state: State, step: Step) -> None:
+    """Remove the motion that all views share."""
+    poses = state.part(Poses)
+    if poses.values is not None:
+        poses.put(state, _without_common(state, poses.values))
 
 
-def put_back_if_worse(state: State, progress: float) -> None:
+def judge(state: State, step: Step) -> None:
     """Once, go back to the given poses if the setting `cameras.poses` is "auto" and features do not fit the refined ones far better."""
-    if state.poses is None or state.settings.cameras.poses != "auto" or state.poses_judged or progress < KNOWN:
+    poses = state.part(Poses)
+    if poses.values is None or state.settings.cameras.poses != "auto" or poses.judged:
         return
-    state.poses_judged = True
+    poses.judged = True
     # The pairs that `start` matched: neighbours may be others by now, with too few matches to tell.
     matches = match_neighbours(
-        [replace(view, camera=camera) for view, camera in zip(state.views, state.given, strict=True)]
+        [replace(view, camera=camera) for view, camera in zip(state.views, poses.given, strict=True)]
     )
-    given, found = (pixels_apart(matches, cameras) for cameras in (state.given, [view.camera for view in state.views]))
+    given, found = (pixels_apart(matches, cameras) for cameras in (poses.given, [view.camera for view in state.views]))
     if found < BETTER * given:
         what = f"the cameras' poses are refined: features are {found:.1f} pixels off, and were {given:.1f}"
     else:
-        restore(state, None)
+        poses.put(state, None)
         what = f"the cameras' poses are kept: features are {given:.1f} pixels off, and {found:.1f} with refined ones"
     state.announce("poses", what)
 
@@ -94,7 +132,7 @@ def shifts(state: State) -> np.ndarray:
     points = positions[:: max(1, len(positions) // SAMPLE)]
     points = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     found = []
-    for given, view in zip(state.given, state.views, strict=True):
+    for given, view in zip(state.part(Poses).given, state.views, strict=True):
         before, after = (points @ camera.projection.T for camera in (given, view.camera))
         shown = (before[:, 2] > state.near) & (after[:, 2] > state.near)
         difference = (before[:, :2] / before[:, 2:] - after[:, :2] / after[:, 2:])[shown]
@@ -104,9 +142,10 @@ def shifts(state: State) -> np.ndarray:
 
 def refined(state: State) -> Capture:
     """Return the capture with the refined cameras of the training views."""
-    if state.poses is None:
+    values = state.part(Poses).values
+    if values is None:
         return state.capture
-    poses = {view.camera.name: pose for view, pose in zip(state.views, state.poses, strict=True)}
+    poses = {view.camera.name: pose for view, pose in zip(state.views, values, strict=True)}
     centre, radius = state.capture.centre, state.capture.radius
     views = [
         replace(view, camera=posed(view.camera, poses[view.camera.name], centre, radius))
@@ -117,17 +156,10 @@ def refined(state: State) -> Capture:
     return replace(state.capture, views=views)
 
 
-def _move(state: State, index: int) -> None:
-    camera = state.given[index]
-    if state.poses is not None:
-        camera = posed(camera, state.poses[index], state.capture.centre, state.capture.radius)
-    state.move_camera(index, camera)
-
-
-def _without_common(state: State) -> Tensor:
+def _without_common(state: State, values: Tensor) -> Tensor:
     """Return the poses without what moves the scene as a whole: their mean, and the mean motion towards the cameras, which scales it."""
-    towards = np.array([camera.position - state.capture.centre for camera in state.given])
+    towards = np.array([camera.position - state.capture.centre for camera in state.part(Poses).given])
     towards = torch.from_numpy(towards / np.linalg.norm(towards, axis=1, keepdims=True)).float()
-    poses = state.poses - state.poses.mean(dim=0)
+    poses = values - values.mean(dim=0)
     poses[:, 3:] -= (poses[:, 3:] * towards).sum(dim=1).mean() * towards
     return poses

@@ -19,8 +19,10 @@ from refgs.camera import Camera
 from refgs.capture import load_depth, load_normals
 from refgs.capture.poses import split_similarity
 from refgs.render.rendering import Rendering
+from refgs.train.part import Part
 from refgs.train.photo import Photo
-from refgs.train.state import Priors, State, spread
+from refgs.train.state import State, spread
+from refgs.train.timeline import Step
 
 FADED = 0.6  # part of the training after which priors have no weight
 VIEWS = 16  # that are looked at to find what the files mean, at the most
@@ -33,7 +35,26 @@ SOLID = 0.5  # alpha
 CODE = 127  # of a component of 1 in a map of normals
 
 
-def start(state: State) -> None:
+Maps = dict[int, tuple[Tensor, Camera]]
+"""Guesses by the view's number: a map, and the photo's camera for its size."""
+
+
+class Priors(Part):
+    """Hold what other programs guessed from the training views' photos.
+
+    `normals` are int8 (H, W, 3) in the camera's axes, and `depth` float32 (H, W) of any scale and shift, which is a `disparity` for all
+    views or for none. Both are 0 where nothing is known.
+    """
+
+    name = "priors"
+
+    def __init__(self) -> None:
+        self.normals: Maps = {}
+        self.depth: Maps = {}
+        self.disparity = False
+
+
+def load(state: State) -> None:
     """Load the priors of the training views, and find out what they mean: the axes of normals, and whether depth is a disparity.
 
     They are used only if all photos have masks: else nothing is known of the shape to compare them with.
@@ -45,25 +66,27 @@ def start(state: State) -> None:
         state.announce("priors", "without normals or depth from elsewhere: not every photo has a mask of the object")
         return
     with state.clock.part("start"):
-        found = Priors({}, {}, False)
+        normals, depth = {}, {}
         for index, view in enumerate(state.views):
             if (files := given.get(view.camera.name)) is None:
                 continue
             if (prior := load_normals(files)) is not None:
                 codes = torch.from_numpy(np.rint(CODE * prior.values).astype(np.int8))
-                found.normals[index] = codes.to(state.device), prior.camera
+                normals[index] = codes.to(state.device), prior.camera
             if (prior := load_depth(files)) is not None:
-                found.depth[index] = torch.from_numpy(prior.values).to(state.device), prior.camera
-        state.priors = Priors(_with_axes(state, found.normals), *_with_kind(state, found.depth))
+                depth[index] = torch.from_numpy(prior.values).to(state.device), prior.camera
+        found = state.part(Priors)
+        found.normals = _with_axes(state, normals)
+        found.depth, found.disparity = _with_kind(state, depth)
 
 
-def loss(state: State, view: int, rendering: Rendering, photo: Photo, progress: float) -> Tensor | None:
-    """Compute the loss of a view's priors. Return None if it has none, or if they have faded.
+def loss(state: State, step: Step) -> Tensor | None:
+    """Compute the loss of the view's priors. Return None if it has none, or if they have faded.
 
-    `rendering` is the picture of the `photo` of the view. `progress` is 0 at the start of the training and 1 at its end. As in `objective`,
-    the loss is a mean over the pixels of the whole photo.
+    As in `objective`, the loss is a mean over the pixels of the whole photo.
     """
-    weight, priors = state.settings.loss.prior * fade(progress), state.priors
+    view, rendering, photo = step.view, step.rendering, step.photo
+    weight, priors = state.settings.loss.prior * fade(step.progress), state.part(Priors)
     terms = []
     if weight > 0 and view in priors.normals:
         terms.append(normals_loss(rendering, photo, *priors.normals[view]))
@@ -157,7 +180,7 @@ def axes_of(pairs: Iterable[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor | No
     return None, float(across[1].min())
 
 
-def _with_axes(state: State, normals: dict[int, tuple[Tensor, Camera]]) -> dict[int, tuple[Tensor, Camera]]:
+def _with_axes(state: State, normals: Maps) -> Maps:
     """Return the maps of normals in the axes of their cameras, or none if it is not clear which axes they have."""
     if not normals:
         return {}
@@ -207,7 +230,7 @@ def _near_outline(mask: Tensor) -> Tensor:
     return (shown > deep)[0]
 
 
-def _with_kind(state: State, depth: dict[int, tuple[Tensor, Camera]]) -> tuple[dict[int, tuple[Tensor, Camera]], bool]:
+def _with_kind(state: State, depth: Maps) -> tuple[Maps, bool]:
     """Return the maps of depth, or none if they are unlike that of the surfels at the start; and whether they are disparities.
 
     Disparity falls where depth rises: its correlation with depth is negative.

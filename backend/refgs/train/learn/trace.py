@@ -1,8 +1,13 @@
-"""Trace inter-reflection on a mesh made from the surfels. For trainings that do not trace it, give the user the reason."""
+"""Trace inter-reflection on a mesh made from the surfels."""
 
+from collections.abc import Mapping
+
+import numpy as np
 import torch
+from torch import Tensor
 
 from refgs.errors import InputError
+from refgs.formats.mesh import Mesh
 from refgs.geometry.mesh import clean
 from refgs.geometry.visibility import Occluder
 from refgs.memory import trim
@@ -11,58 +16,66 @@ from refgs.model.surfels import Surfels
 from refgs.render.extract import extract
 from refgs.render.relight import received
 from refgs.render.volume import with_normals_last
-from refgs.train.decide import needs
+from refgs.train.part import Fact, Part
 from refgs.train.state import State, why_not_traced
-from refgs.train.timeline import faint_now
+from refgs.train.timeline import Step
 
 VIEWS = 24  # at least, that the mesh is fused from; all where there are fewer
 
 
-def trace_due(state: State, progress: float) -> None:
-    """Extract a new mesh and trace inter-reflection on it, if this iteration is scheduled for it."""
-    settings = state.settings.indirect
-    # Materials would no longer adapt to a mesh that is made after the residual has started to learn.
-    learns = settings.start <= progress < state.residual_start
-    if not learns or state.iteration % settings.every or state.initial or state.ended or faint_now(state):
-        return
-    if not why_not_traced(state):
-        with state.clock.part("visibility"):
-            _trace(state)
+class TracedMesh(Part):
+    """Keep the mesh on which inter-reflection is traced, `state.occluder`, in checkpoints."""
+
+    name = "occluder"
+
+    def tensors(self, state: State) -> dict[str, Tensor]:
+        if state.occluder is None:
+            return {}
+        mesh = state.occluder.mesh
+        return {"vertices": torch.from_numpy(mesh.vertices), "faces": torch.from_numpy(mesh.faces.astype(np.int32))}
+
+    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping[str, Tensor]) -> None:
+        state.occluder = None
+        if tensors and not why_not_traced(state):
+            state.occluder = Occluder(Mesh(tensors["vertices"].numpy(force=True), tensors["faces"].numpy(force=True)))
 
 
 @torch.no_grad()
-def _trace(state: State) -> None:
-    """Make a new mesh from the surfels, and decide whether inter-reflection is needed.
+def make_mesh(state: State, step: Step) -> None:
+    """Make a new mesh from the surfels to trace on, and measure on how much of the object it mirrors itself (`step.hidden`)."""
+    if why_not_traced(state):
+        return
+    with state.clock.part("visibility"):
+        capture, cameras = state.capture, state.spread_cameras(VIEWS)
+        state.occluder = None
+        trim()  # before the depth maps of all cameras are held
+        inputs = state.inputs()
+        inside = inputs.surfels.chosen(state.wanted())
+        with state.clock.part("mesh"):
+            side = state.settings.indirect.resolution
+            mesh, _ = extract(inside, cameras, state.near, capture.centre, capture.radius, side)
+            try:
+                state.occluder = Occluder(clean(mesh, triangles=len(mesh.faces)))
+            except InputError:  # there is no surface yet
+                return
+        inputs, hidden, solid = inputs._replace(surfels=inside, occluder=state.occluder), 0.0, 1e-9
+        for camera in cameras[::3]:
+            seen = state.picture(inputs, camera)
+            opaque = seen.alpha > 0.5
+            hidden += float((1 - seen.visibility)[opaque].sum())
+            solid += float(opaque.sum())
+        step.hidden = hidden / solid
+        if "indirect_dc" not in state.learned.moments:
+            # Start from the light that the surfels mirrored until now, so that the picture changes little.
+            start, rest = inputs.environment.harmonics, state.learned["indirect_rest"]
+            state.learned["indirect_dc"][:], rest[:] = start[:1], start[1 : 1 + rest.shape[1]]
 
-    If it is, trace rays to find out how much the mesh shadows and lights each surfel.
-    """
-    capture, cameras = state.capture, state.spread_cameras(VIEWS)
-    state.occluder = None
-    trim()  # before the depth maps of all cameras are held
-    inputs = state.inputs()
-    surfels, environment = inputs.surfels, inputs.environment
-    inside = surfels.chosen(state.wanted())
-    with state.clock.part("mesh"):
-        side = state.settings.indirect.resolution
-        mesh, _ = extract(inside, cameras, state.near, capture.centre, capture.radius, side)
-        try:
-            state.occluder = Occluder(clean(mesh, triangles=len(mesh.faces)))
-        except InputError:  # there is no surface yet
-            return
-    inputs, hidden, solid = inputs._replace(surfels=inside, occluder=state.occluder), 0.0, 1e-9
-    for camera in cameras[::3]:
-        seen = state.picture(inputs, camera)
-        opaque = seen.alpha > 0.5
-        hidden += float((1 - seen.visibility)[opaque].sum())
-        solid += float(opaque.sum())
-    if "indirect_dc" not in state.learned.moments:
-        # Start from the light that the surfels mirrored until now, so that the picture changes little.
-        start, rest = environment.harmonics, state.learned["indirect_rest"]
-        state.learned["indirect_dc"][:], rest[:] = start[:1], start[1 : 1 + rest.shape[1]]
-    with state.clock.part("deciding"):
-        needs.evaluate_mesh(state, hidden / solid)
-    if state.occluder is not None and "received" in state.learned:
-        # Traced anew with each mesh, for light and mesh are better known by then.
-        traced = Surfels(*(value.cpu() for value in with_normals_last(surfels)))
-        light = Environment(environment.radiance.cpu())  # in the world's frame: in the camera's nothing is traced
-        state.learned["received"][:] = received(traced, state.occluder, light)
+
+@torch.no_grad()
+def trace_received(state: State, step: Step) -> None:
+    """Trace how much of the light each surfel receives: with each new mesh, for light and mesh are better known by then."""
+    if state.occluder is None or "received" not in state.learned:
+        return
+    traced = Surfels(*(value.cpu() for value in with_normals_last(state.surfels())))
+    light = Environment(state.environment().radiance.cpu())  # in the world's frame: in the camera's nothing is traced
+    state.learned["received"][:] = received(traced, state.occluder, light)

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from refgs.model.surfels import Surfels
 from refgs.train.material.changes import SATURATED, from_grey, neighbours, pooled
+from refgs.train.material.metals import Metals
 from refgs.train.state import State
+from refgs.train.timeline import Step
 
-EVERY = 50  # iterations
-UNTIL = 0.6  # part of the training
 AVERAGED = 16  # neighbours
 METALLIC = 0.8
 
@@ -25,12 +25,12 @@ def coloured_metal(surfels: Surfels) -> Tensor:
 
 
 @torch.no_grad()
-def even_out_due(state: State, progress: float) -> None:
-    """Average base colour and roughness of coloured metal over neighbours, if this iteration is scheduled for it.
+def even_out(state: State, step: Step) -> None:
+    """Average base colour and roughness of coloured metal over neighbours.
 
     Opaque neighbours count more, and only those that are coloured metal, too.
     """
-    if not state.metals_set or state.iteration % EVERY or progress >= UNTIL:
+    if not state.part(Metals).found:
         return
     surfels = state.surfels()
     if not (metal := coloured_metal(surfels)).any():

@@ -7,6 +7,8 @@ Where nearly all of the surface shines as coloured metals do, metallic no longer
 again, since roughness, light and base colour explain rough metal and paint about as well.
 """
 
+from collections.abc import Mapping
+
 import torch
 
 from refgs.formats.hints import KINDS
@@ -14,10 +16,10 @@ from refgs.model.surfels import raw_metallic
 from refgs.train.material import mirrored, same_material
 from refgs.train.material.changes import falls_as_metal, observe, shines_as_metal
 from refgs.train.material.changing_light import explained
+from refgs.train.part import Fact, Part
 from refgs.train.state import State
-from refgs.train.timeline import SOONEST, decidable
+from refgs.train.timeline import Step, metals_decidable
 
-KNOWN = 0.1  # part of the training after which surfels lie near enough to the surface
 METAL, PAINT = 0.9, 0.02  # metallic; training can still change it
 CERTAIN = 0.85  # part of the surface that shines as coloured metals do, above which all is metal; a gold cape has 0.95, matte clay 0.71
 MOSTLY = 0.6  # part of what is coloured that shines, above which what is dark may be metal, too; a bronze head has 0.69, a car 0.14
@@ -29,7 +31,28 @@ DOUBTFUL = 0.5  # doubt from which on photos do not tell
 HELD = {"metal": 0.98, "paint": 0.002}  # metallic that is held, of each of `formats.hints.KINDS`
 
 
-def set_metals_due(state: State, progress: float) -> None:
+class Metals(Part):
+    """Remember whether metals were `found`, by photos or by hints."""
+
+    name = "metals"
+
+    def __init__(self) -> None:
+        self.found = False
+
+    def start(self, state: State) -> None:
+        self.found = False
+        if "metallic" in state.learned:
+            held = torch.zeros(state.learned.count, dtype=torch.bool, device=state.device)
+            state.learned.learn("held", held)
+
+    def facts(self, state: State) -> dict[str, Fact]:
+        return {"found": self.found}
+
+    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping[str, torch.Tensor]) -> None:
+        self.found = bool(facts.get("found", True))
+
+
+def find_metals(state: State, step: Step) -> None:
     """Once, early in the training, raise the metallic of the surfels that change with the view as only metals do.
 
     See `shines_as_metal` for coloured metals, `falls_as_metal` for all. If a light that changed from photo to photo explains the changes
@@ -42,8 +65,7 @@ def set_metals_due(state: State, progress: float) -> None:
 
     Schedules that propagate normals find metals by that, as the paper does: nothing is set there.
     """
-    early = progress - state.settings.initial.until < KNOWN or state.iteration < SOONEST
-    if state.metals_set or early or progress >= state.residual_start or not _decidable(state):
+    if state.part(Metals).found:
         return
     observations, metallic = observe(state), state.learned["metallic"]
     positions, weight = state.learned["position"].detach(), observations.pixels.sum(dim=1) * state.wanted()
@@ -69,21 +91,20 @@ def set_metals_due(state: State, progress: float) -> None:
         else:
             metallic[metal] = metallic[metal].clamp(min=raw_metallic(METAL))
     state.learned.forget("metallic", metal | refuted)
-    state.metals_set = True
+    state.part(Metals).found = True
     part = float(weight[metal].sum()) / max(whole, 1e-6)
     state.announce("metals", f"{part:.0%} of the surface shines as metals do")
 
 
 @torch.no_grad()
-def judge_due(state: State, progress: float) -> None:
-    """After each new mesh, judge again which surfels are metal, by what they mirror (see `mirrored`, `same_material`).
+def judge(state: State, step: Step) -> None:
+    """Judge again which surfels are metal, by what they mirror (see `mirrored`, `same_material`).
 
     A surfel that is taken for paint but is of a piece with metals becomes metal, with their base colour and roughness: it mirrors evenly,
     such as the lower half of a ball on a table, and has learned the mirrored table as its own colour. A metal that looks the same from
     everywhere, where it would mirror changes, becomes paint. Training can still change both.
     """
-    due = progress < state.residual_start and state.iteration % state.settings.indirect.every == 0
-    if not due or not state.metals_set or not state.from_hull or not _decidable(state):
+    if not state.part(Metals).found:
         return
     surfels, seen, fit = mirrored.observe(state)
     found = same_material.decide(surfels, seen, fit)
@@ -111,7 +132,7 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
     and `what`, the words that are announced, if that is more than TOLD. Returns None where photos do not decide what is metal: without a
     light, without specular shading, or without a mask of each photo. Surfels whose metallic is held are not in doubt.
     """
-    if not state.from_hull or not _decidable(state):
+    if not state.from_hull or not metals_decidable(state, state.iteration):
         return None
     surfels, seen, fit = mirrored.observe(state)
     found = same_material.doubt(surfels, seen, fit)
@@ -126,12 +147,6 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
     return found, facts
 
 
-def _decidable(state: State) -> bool:
-    """Tell whether photos decide what is metal: not in schedules that find metals otherwise, or that have no specular shading."""
-    settings = state.settings
-    return settings.render.reflection == "microfacet" and not settings.propagation.every and decidable(state)
-
-
 @torch.no_grad()
 def hold_as(state: State, kinds: torch.Tensor) -> None:
     """Hold the metallic of surfels from now on (see `hold`). `kinds` (N,) has their index in `hints.KINDS`, −1 for those that learn."""
@@ -139,16 +154,11 @@ def hold_as(state: State, kinds: torch.Tensor) -> None:
         state.learned["metallic"][kinds == number] = raw_metallic(HELD[kind])
     state.learned["held"].copy_(kinds >= 0)
     state.learned.forget("metallic", kinds >= 0)
-    state.metals_set = True
-
-
-def hold_none(state: State) -> None:
-    """Let the metallic of all surfels learn. `held` (N,) is true for those whose metallic stays; halves of a divided one are held, too."""
-    state.learned.learn("held", torch.zeros(state.learned.count, dtype=torch.bool, device=state.device))
+    state.part(Metals).found = True
 
 
 def hold(state: State) -> None:
-    """Remove the gradient of the metallic of surfels that are held, so that it stays."""
+    """Remove the gradient of the metallic of surfels that are held, so that it stays: `held` (N,) is true for them."""
     metallic = state.learned.get("metallic")
     if metallic is not None and metallic.grad is not None:
         metallic.grad.masked_fill_(state.learned["held"], 0)

@@ -18,6 +18,7 @@ from refgs.model.surfels import Surfels
 from refgs.render import reference
 from refgs.render.relight import blend, mirror
 from refgs.train import probe
+from refgs.train.learn.exposures import exposure
 from refgs.train.material.changes import LEAST_CLIPPED, LEAST_PIXELS, NEIGHBOURS, VIEWS, linear, neighbours, pooled
 from refgs.train.state import RenderInputs, State
 
@@ -101,9 +102,9 @@ def _look(state: State, inputs: RenderInputs, views: list[int]) -> Seen:
 
 def _sums(state: State, inputs: RenderInputs, view: int) -> Tensor:
     """Sum over each surfel's pixels in a photo (N, 8): linear radiance, weights, those of clipped pixels, and blended normals."""
-    photo, exposure = state.photo(view), state.exposure(view)
+    photo, factor = state.photo(view), exposure(state, view)
     radiance = linear(photo)
-    radiance = radiance if exposure is None else radiance / exposure
+    radiance = radiance if factor is None else radiance / factor
     one = torch.ones_like(radiance[..., :1])
     clipped = photo.clipped.any(dim=-1, keepdim=True).float()
     shown = torch.cat([radiance, one, clipped, probe.picture(state, view, inputs).normal], dim=-1)

@@ -1,0 +1,45 @@
+"""Average the loss over the last iterations, for the history and the progress that is reported."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from refgs.compare.metrics import decibels
+from refgs.train.part import Fact, Part
+from refgs.train.state import State
+
+
+class Means(Part):
+    """Hold running means of what `Trainer.step` returns: the `loss`, and the mean squared error, `square`. Empty before the first step."""
+
+    name = "means"
+
+    def __init__(self) -> None:
+        self.values: dict[str, Tensor] = {}
+
+    def tensors(self, state: State) -> dict[str, Tensor]:
+        return self.values
+
+    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping[str, Tensor]) -> None:
+        self.values = dict(tensors)
+
+    def add(self, figures: Mapping[str, Tensor]) -> None:
+        """Add the figures of an iteration. A graphics card need not have computed them yet."""
+        self.values = {name: running(self.values.get(name, figure), figure) for name, figure in figures.items()}
+
+    @property
+    def loss(self) -> float:
+        """Return the mean loss."""
+        return float(self.values["loss"])
+
+    @property
+    def psnr(self) -> float:
+        """Return the PSNR on training views, in dB, of the mean squared error."""
+        return decibels(float(self.values["square"]))
+
+
+def running(mean: Tensor, figure: Tensor) -> Tensor:
+    """Return the running mean after a new value, `figure`. If the value is not finite, return the mean unchanged."""
+    known = torch.where(mean.isfinite(), figure + 0.95 * (mean - figure), figure)
+    return torch.where(figure.isfinite(), known, mean)
