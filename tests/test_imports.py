@@ -25,8 +25,9 @@ def write(root, files):
         "backend/refgs/model/__init__.py": "",
         "backend/refgs/model/surfels.py": "import torch\nfrom refgs.camera import Camera",
         "backend/refgs/train/__init__.py": "",
-        "backend/refgs/train/loop.py": "from refgs.model import surfels\nfrom refgs.train.adam import Adam",
-        "backend/refgs/train/adam.py": "from refgs.model.surfels import Surfels",
+        "backend/refgs/train/learn/__init__.py": "",
+        "backend/refgs/train/learn/loop.py": "from refgs.model import surfels\nfrom refgs.train.learn.adam import Adam",
+        "backend/refgs/train/learn/adam.py": "from refgs.model.surfels import Surfels",
         "refgs_addon/__init__.py": "import bpy",
         "refgs_addon/jobs.py": "from . import errors",
         "refgs_addon/errors.py": "",
@@ -48,20 +49,20 @@ def test_imports_of_lower_floors_are_allowed(tmp_path):
     assert check(tmp_path) == (0, "")
 
 
-UP = "def f():\n    from refgs.train.loop import Loop\n"
-HIDDEN = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from refgs.train.loop import Loop\n"
+UP = "def f():\n    from refgs.train.learn.loop import Loop\n"
+HIDDEN = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from refgs.train.learn.loop import Loop\n"
 
 
 @pytest.mark.parametrize(
     ("name", "text", "expected"),
     [
-        ("backend/refgs/model/surfels.py", UP, ["surfels.py:2", "refgs.train.loop, which is on a floor above"]),
-        ("backend/refgs/model/light.py", HIDDEN, ["light.py:3", "refgs.train.loop, which is on a floor above"]),
+        ("backend/refgs/model/surfels.py", UP, ["surfels.py:2", "refgs.train.learn.loop, which is on a floor above"]),
+        ("backend/refgs/model/light.py", HIDDEN, ["light.py:3", "refgs.train.learn.loop, which is on a floor above"]),
         ("backend/refgs/model/light.py", "from refgs import train", ["light.py:1", "refgs.train, which is on a floor"]),
-        ("backend/refgs/train/adam.py", "import refgs.train.loop", ["circle", "loop.py:2", "adam.py:1"]),
-        ("backend/refgs/train/adam.py", UP, ["circle", "loop.py:2", "adam.py:2"]),
-        ("backend/refgs/train/adam.py", HIDDEN, ["circle", "loop.py:2", "adam.py:3"]),
-        ("backend/refgs/train/adam.py", "from .loop import Loop", ["circle", "loop.py:2", "adam.py:1"]),
+        ("backend/refgs/train/learn/adam.py", "import refgs.train.learn.loop", ["circle", "loop.py:2", "adam.py:1"]),
+        ("backend/refgs/train/learn/adam.py", UP, ["circle", "loop.py:2", "adam.py:2"]),
+        ("backend/refgs/train/learn/adam.py", HIDDEN, ["circle", "loop.py:2", "adam.py:3"]),
+        ("backend/refgs/train/learn/adam.py", "from .loop import Loop", ["circle", "loop.py:2", "adam.py:1"]),
         ("refgs_addon/errors.py", "from .scene.run import f", ["circle", "jobs.py:1", "run.py:1", "errors.py:1"]),
         ("backend/refgs/camera.py", "def f():\n    import bpy", ["camera.py:2", "nothing under backend/ imports bpy"]),
         ("backend/refgs/camera.py", "from bpy.types import A", ["camera.py:1", "nothing under backend/ imports bpy"]),

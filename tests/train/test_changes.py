@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from refgs.model.surfels import activate, raw_metallic
-from refgs.train.decide.materials import CHANGES
+from refgs.train.decide.materials import SHINES
 from refgs.train.learn.densify import Densification, densify
 from refgs.train.material import changes, metals
 from refgs.train.material.changing_light import CHANGED, LEFT, explained
 from refgs.train.material.metals import Metals
+from refgs.train.material.observe import observe_changes
 from tests.makers.lamps import LAMPS, ORANGE, show
 from tests.makers.training import do, put
 from tests.makers.training import trainer as small
@@ -27,7 +28,7 @@ def made(large_ball, tmp_path):
 def told(made):
     """Return which part of the usable surface shines as metal, and how much the surface changes with the view."""
     state = made.state
-    found = changes.observe(state)
+    found = observe_changes(state)
     usable = found.usable.any(dim=1)
     metal = changes.shines_as_metal(found, state.learned["position"].detach()).clearly
     change = changes.change_seen(found, state.wanted())
@@ -39,13 +40,13 @@ def told(made):
 def test_a_tinted_change_is_a_metals(made, exposure, turn):
     show(made, metallic=6.0, roughness=-1.0, exposure=exposure, turn=turn)
     metal, change = told(made)
-    assert metal > 0.8 and change > 2 * CHANGES
+    assert metal > 0.8 and change > 2 * SHINES
 
 
 def test_a_grey_change_is_a_dielectrics(made):
     show(made, metallic=-6.0, roughness=-2.5, albedo=[-1.0, -2.5, -4.0])
     metal, change = told(made)
-    assert metal < 0.02 and change > CHANGES
+    assert metal < 0.02 and change > SHINES
 
 
 @pytest.mark.parametrize("turn", [False, True])
@@ -55,19 +56,19 @@ def test_what_is_matte_does_not_change(made, exposure, turn):
     made.state.change("render.reflection", "none", "needs", "the test has a matte ball")
     show(made, metallic=-6.0, roughness=6.0, exposure=exposure, turn=turn)
     metal, change = told(made)
-    assert change < 0.75 * CHANGES and metal < 0.05 and falls(made) < 0.02
+    assert change < 0.75 * SHINES and metal < 0.05 and falls(made) < 0.02
 
 
 def test_a_grey_surface_tells_nothing(made):
     show(made, metallic=6.0, roughness=-1.0, albedo=[1.0, 1.0, 1.0])
     metal, change = told(made)
-    assert metal < 0.02 and change > 2 * CHANGES
+    assert metal < 0.02 and change > 2 * SHINES
 
 
 def falls(made):
     """Return which part of the usable surface falls as far below its median as only metals do."""
     state = made.state
-    found = changes.observe(state)
+    found = observe_changes(state)
     light = float(state.environment().radiance.detach().mean())
     metal = changes.falls_as_metal(found, state.learned["position"].detach(), light)
     return float(metal[found.usable.any(dim=1)].float().mean())
@@ -87,18 +88,18 @@ def test_a_small_part_that_shines_counts(made):
     """Check that a patch of chrome, 4 % of a matte surface, changes the surface's figure by more than the threshold."""
     state = made.state
     show(made, metallic=6.0, roughness=-4.0, albedo=[3.0, 3.0, 3.0])
-    found = changes.observe(state)
+    found = observe_changes(state)
     still = found._replace(change=0.02 * torch.randn(found.change.shape, generator=torch.Generator().manual_seed(2)))
-    assert changes.change_seen(still, state.wanted()) < CHANGES
+    assert changes.change_seen(still, state.wanted()) < SHINES
     usable = found.usable.any(dim=1).nonzero()[:, 0]
     patch = usable[::25]
     still.change[patch] = found.change[patch]
-    assert changes.change_seen(still, state.wanted()) > CHANGES
+    assert changes.change_seen(still, state.wanted()) > SHINES
 
 
 def explanation(made):
     """Explain the changes of all surfels."""
-    found, positions = changes.observe(made.state), made.state.learned["position"].detach()
+    found, positions = observe_changes(made.state), made.state.learned["position"].detach()
     (whole,) = explained(found, positions, made.state.capture.radius, torch.ones(len(positions), dtype=torch.bool))
     return whole
 
@@ -116,7 +117,7 @@ def test_a_light_that_changes_does_not_make_metal(made):
     assert found.both - found.lit < 0.5 * LEFT * (1 - found.lit)
     put(made, metallic=0.0)
     do(state, "find metals", 0.25, done=100)
-    assert (state.surfels().metallic < 1.01 * metals.PAINT).all() and "0%" in state.decided["metals"]
+    assert (state.surfels().metallic < 1.01 * metals.GIVEN.paint).all() and "0%" in state.decided["metals"]
 
 
 def test_coloured_noise_does_not_make_metal(made):
@@ -136,7 +137,7 @@ def test_coloured_noise_does_not_make_metal(made):
     assert told(made)[0] > 0.3, "its colours alone are a metal's"
     put(made, metallic=0.0)
     do(state, "find metals", 0.25, done=100)
-    assert float((state.surfels().metallic < 1.01 * metals.PAINT).float().mean()) > 0.9
+    assert float((state.surfels().metallic < 1.01 * metals.GIVEN.paint).float().mean()) > 0.9
     assert "0%" in state.decided["metals"] and state.settings.loss.dark > 0
 
 
@@ -157,7 +158,7 @@ def test_metals_are_set_once(made):
     assert not state.part(Metals).found and "metals" not in state.decided
     do(state, "find metals", 0.25, done=100)
     metallic = activate(state.learned.constant | state.learned.by_row).metallic
-    assert state.part(Metals).found and float((metallic > metals.METAL - 1e-3).float().mean()) > 0.5
+    assert state.part(Metals).found and float((metallic > metals.GIVEN.metal - 1e-3).float().mean()) > 0.5
     assert "as metals do" in state.decided["metals"] and state.settings.loss.dark == 0
     put(made, metallic=0.0)
     do(state, "find metals", 0.3, done=101)
@@ -184,14 +185,14 @@ def test_what_is_metal_all_over_is_held(made, roughness):
     before = state.learned["roughness"].detach().clone()
     for _ in range(5):
         made.step()
-    assert int((state.learned["metallic"] == raw_metallic(metals.HELD["metal"])).sum()) == held
+    assert int((state.learned["metallic"] == raw_metallic(metals.HELD.metal)).sum()) == held
     assert not torch.equal(state.learned["roughness"], before)
     gradient = torch.ones(state.learned.count)
     divided = densify(state.learned, gradient, state.settings.densify, 2 * len(gradient), divide=True)
     state.part(Densification).restart(state)
     made.step()
     assert divided > 0
-    assert int((state.learned["metallic"] == raw_metallic(metals.HELD["metal"])).sum()) > held + 0.9 * divided
+    assert int((state.learned["metallic"] == raw_metallic(metals.HELD.metal)).sum()) > held + 0.9 * divided
 
 
 @pytest.mark.parametrize("albedo, even", [(ORANGE, True), ([1.0, 1.0, 1.0], False)])
@@ -218,7 +219,7 @@ def test_paint_is_averaged_on_coloured_metal_only(made, albedo, even):
 
 def test_a_metallic_that_has_the_held_value_by_chance_still_learns(ball_capture, tmp_path):
     made = small(ball_capture, tmp_path / "run", "train.light_first=0", total=100)
-    put(made, metallic=raw_metallic(metals.HELD["metal"]))
+    put(made, metallic=raw_metallic(metals.HELD.metal))
     made.state.part(Metals).found = True
     before = made.state.learned["metallic"].detach().clone()
     put(made, held=torch.arange(len(before)) % 2 == 0)

@@ -10,6 +10,7 @@ from benchmarks.scenes.analytic import write_ball_capture
 from refgs import train_job
 from refgs.errors import InputError
 from refgs.formats.hints import FILE, Hint, read_hints, write_hints
+from refgs.formats.needs import Found
 from refgs.formats.splats import read_splats
 from refgs.model.surfels import raw_metallic
 from refgs.run_folder import read_run_facts
@@ -23,7 +24,7 @@ from refgs.train.material import metals
 from tests.makers.training import TINY, put, trained, trainer
 
 TOTAL = 400
-METAL, PAINT = (torch.tensor(raw_metallic(metals.HELD[kind])) for kind in ("metal", "paint"))
+METAL, PAINT = (torch.tensor(raw_metallic(metallic)) for metallic in metals.HELD)
 
 
 def silent(event, facts):
@@ -138,7 +139,7 @@ def test_a_surfel_is_what_the_nearest_splat_is(plastic):
 
 def test_metals_come_back_to_a_scene_that_was_taken_for_matte(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", *TINY, total=40)
-    made.state.needs["specular"] = {"needed": False, "why": "the test says so"}
+    made.state.needs["specular"] = Found(needed=False, why="the test says so")
     needs.SPECULAR.apply(made.state, made.state.needs["specular"])
     made.run()
     write_asset(made.state)

@@ -15,12 +15,13 @@ import pytest
 import torch
 
 from benchmarks.scenes.analytic import write_ball_capture
+from refgs.formats.needs import Found
 from refgs.formats.splats import read_splats
 from refgs.model.environment import Environment
 from refgs.run import open_run
 from refgs.train import probe
 from refgs.train.decide import iterations, lighting, needs, photos
-from refgs.train.decide.materials import CHANGES
+from refgs.train.decide.materials import SHINES
 from refgs.train.keep.asset import write_asset
 from refgs.train.keep.measures import held_out_psnr
 from refgs.train.learn.losses import objective
@@ -62,7 +63,7 @@ def chalk(matte, tmp_path_factory):
 
 def test_what_is_matte_goes_without_specular(chalk):
     found = chalk.state.needs["specular"]
-    assert not found["needed"] and found["statistic"] < found["threshold"] and found["megabytes"] > 0
+    assert not found.needed and found.statistic < found.threshold and found.megabytes > 0
     assert chalk.state.settings.render.reflection == "none" and chalk.state.settings.environment.resolution == 16
     left = {"metallic", "roughness", "indirect_dc", "indirect_rest", "received"}
     assert not left & {*chalk.state.learned} and not left & {*chalk.state.learned.moments}
@@ -75,13 +76,11 @@ def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
     The setting needs.iterations=on keeps all iterations. A duration given by the user keeps all of them too.
     """
     found = chalk.state.needs["iterations"]
-    assert not found["needed"] and found["seconds"] > 0
-    assert found["statistic"] == chalk.state.needs["specular"]["statistic"]
-    assert (
-        chalk.state.iteration == chalk.state.total == found["total"] == 100 + round(iterations.Iterations.ENOUGH * 200)
-    )
+    assert not found.needed and found.seconds > 0
+    assert found.statistic == chalk.state.needs["specular"].statistic
+    assert chalk.state.iteration == chalk.state.total == found.total == 100 + round(iterations.Iterations.ENOUGH * 200)
     forced = trainer(matte, tmp_path / "off", "needs.specular=off", total=150)
-    assert forced.state.total == forced.state.needs["iterations"]["total"] == round(iterations.Iterations.ENOUGH * 150)
+    assert forced.state.total == forced.state.needs["iterations"].total == round(iterations.Iterations.ENOUGH * 150)
     assert trainer(matte, tmp_path / "on", "needs.specular=off", "needs.iterations=on", total=150).state.total == 150
     forced.state.needs.clear()
     forced.state.plan = Plan(1.0)
@@ -93,10 +92,10 @@ def test_a_convex_mirror_keeps_specular_and_does_without_reflections(ball_captur
     made = trainer(ball_capture, tmp_path / "run", "surfels.metallic=0.9", total=150)
     made.run(stop=lambda: made.state.iteration == 110)
     found = made.state.needs["specular"]
-    assert found["needed"] and found["statistic"] > 1 and "metallic" in made.state.learned
+    assert found.needed and found.statistic > 1 and "metallic" in made.state.learned
     assert made.state.settings.render.reflection == "microfacet" and made.state.total == 150
     found = made.state.needs["reflections"]
-    assert not found["needed"] and found["statistic"] < found["threshold"]
+    assert not found.needed and found.statistic < found.threshold
     assert made.state.occluder is None and "received" not in made.state.learned and why_not_traced(made.state)
 
 
@@ -153,7 +152,7 @@ def test_decisions_are_shown(chalk, ball_capture, tmp_path):
             assert -10 * np.log10(np.square(picture - photo).mean()) == pytest.approx(shown[f"psnr_{kind}"], abs=0.3)
         # What is matte looks the same if what is mirrored does not change with the view.
         assert (shown["psnr_on"] > shown["psnr_off"] + 0.5) == needed
-    assert "pictures" not in chalk.state.needs["iterations"]
+    assert chalk.state.needs["iterations"].pictures is None
 
 
 def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
@@ -168,7 +167,7 @@ def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
     first.run(stop=lambda: first.state.iteration == 115)
     second = trainer(matte, tmp_path / "cut", *more, total=150)
     second.resume()
-    assert second.state.needs == first.state.needs and not second.state.needs["specular"]["needed"]
+    assert second.state.needs == first.state.needs and not second.state.needs["specular"].needed
     second.run()
     check_equal(whole, second)
 
@@ -201,17 +200,17 @@ def test_a_scene_that_was_taken_for_matte_gets_its_gloss_back(matte, ball_captur
     made = trainer(matte, tmp_path / "run", *options, total=300)
     state = made.state
     made.run(stop=lambda: "specular" in state.needs)
-    assert not state.needs["specular"]["needed"] and "metallic" not in state.learned
-    assert state.total == state.needs["iterations"]["total"] < 300
+    assert not state.needs["specular"].needed and "metallic" not in state.learned
+    assert state.total == state.needs["iterations"].total < 300
     while 2 * state.iteration < state.total - 2:
         made.step()
     made.save()
-    assert "again" not in state.needs["specular"]
+    assert state.needs["specular"].again is None
     state.photos = [Photo.of(view) for view in small(ball_capture, tmp_path / "mirror").state.views]
     for _ in range(3):
         made.step()
     found = state.needs["specular"]
-    assert found["needed"] and found["statistic"] >= found["threshold"] and "halfway" in state.decided["specular"]
+    assert found.needed and found.statistic >= found.threshold and "halfway" in state.decided["specular"]
     assert {"metallic", "roughness", "received"} <= {*state.learned} and state.total == 300
     assert state.settings.render.reflection == "microfacet" and "iterations" not in state.needs
     assert state.effective.rows()["train.iterations"]["became"] == 300
@@ -230,15 +229,15 @@ def test_a_scene_that_was_taken_for_matte_gets_its_gloss_back(matte, ball_captur
 
 def test_what_a_setting_leaves_out_stays_out_when_gloss_comes_back(matte, tmp_path):
     state = trainer(matte, tmp_path / "run", "needs.iterations=off", total=150).state
-    recorded = {"specular": {"needed": False, "why": ""}, "iterations": dict(state.needs["iterations"])}
-    state.needs["specular"] = {"needed": True, "why": "taken back"}
+    recorded = {"specular": Found(needed=False, why=""), "iterations": state.needs["iterations"]}
+    state.needs["specular"] = Found(needed=True, why="taken back")
     needs.restore(state, recorded)
-    assert state.total == state.needs["iterations"]["total"] < 150
+    assert state.total == state.needs["iterations"].total < 150
 
 
 def test_a_matte_scene_is_looked_at_twice(chalk):
     found = chalk.state.needs["specular"]
-    assert not found["needed"] and found["again"] < CHANGES
+    assert not found.needed and found.again < SHINES
 
 
 def test_reflections_by_what_they_could_be_worth(ball_capture, tmp_path):
@@ -251,10 +250,10 @@ def test_reflections_by_what_they_could_be_worth(ball_capture, tmp_path):
     made.state.occluder = as_occluder(plate(0.5, -1), scale=3.0)  # faces down, above the ball
     do(made.state, "decide on inter-reflection", hidden=0.2)
     found = made.state.needs.pop("reflections")
-    assert found["needed"] and found["statistic"] > lighting.Reflections.threshold
+    assert found.needed and found.statistic > lighting.Reflections.threshold
     put(made, metallic=-10, albedo=0, roughness=5)
     do(made.state, "decide on inter-reflection", hidden=0.2)
-    assert not made.state.needs["reflections"]["needed"]
+    assert not made.state.needs["reflections"].needed
 
 
 @pytest.mark.parametrize("hidden", [0.004, 0.2])
@@ -278,8 +277,8 @@ def test_reflections_of_a_small_part_are_kept(ball_capture, tmp_path, hidden):
         state.occluder = as_occluder(plate(1.2, -1), scale=0.9)
         do(state, "decide on inter-reflection", hidden=hidden)
         found = state.needs.pop("reflections")
-        assert found["needed"] == chrome
-        assert found["threshold"] == lighting.Reflections.SMALL_PART  # the whole decided nothing
+        assert found.needed == chrome
+        assert found.threshold == lighting.Reflections.SMALL_PART  # the whole decided nothing
 
 
 def test_views_that_show_the_same_from_the_same_place(ball_capture, tmp_path):
@@ -361,7 +360,7 @@ def test_what_the_part_about_the_mask_saves_is_timed(ball_capture, tmp_path, mon
     monkeypatch.setattr(probe, "seconds_saved", lambda trainer, whole: asked.append(whole) or 8.0)
     made.run(stop=lambda: made.state.iteration == 6)
     # 7/8 of 8 s are saved: one iteration in eight uses the full photo.
-    assert asked == [True] and made.state.needs["outside"]["seconds"] == 7.0
+    assert asked == [True] and made.state.needs["outside"].seconds == 7.0
     assert next(row for row in needs.rows(made.state) if row["need"] == "outside")["saved"] == "7.0 s, 0.0 MB"
 
 
@@ -400,7 +399,7 @@ def test_degrees_by_what_they_are_worth(ball_capture, tmp_path):
         made.state.needs.pop("degrees", None)
         do(made.state, "decide on degrees of harmonics", progress=1.0)
         assert made.state.learned["sh_rest"].shape[1] == kept
-        assert made.state.needs["degrees"]["needed"] == (kept == 15)
+        assert made.state.needs["degrees"].needed == (kept == 15)
     made.step()
 
 
@@ -411,7 +410,7 @@ def test_what_all_have_alike_is_said_once(ball_capture, tmp_path):
     write_asset(made.state)
     splats = read_splats(tmp_path / "run" / "splats.ply")
     assert {*splats.constants} == {"metallic"} and splats.roughness.std() > 0
-    assert made.state.needs["constants"]["statistic"] == 1 and abs(made.state.needs["constants"]["decibels"]) < 0.01
+    assert made.state.needs["constants"].statistic == 1 and abs(made.state.needs["constants"].decibels) < 0.01
     assert open_run(tmp_path / "run").settings.render.reflection == "microfacet"
 
 

@@ -11,7 +11,8 @@ from refgs.formats.splats import read_splats
 from refgs.model.surfels import activate, raw_metallic
 from refgs.train.keep.asset import write_asset
 from refgs.train.material import metals, mirrored, same_material
-from refgs.train.material.mirrored import Fit, Seen
+from refgs.train.material.mirrored import Fit
+from refgs.train.material.observe import Seen
 from tests.makers.lamps import show
 from tests.makers.training import do, put
 from tests.makers.training import trainer as small
@@ -32,9 +33,9 @@ def made(large_ball, tmp_path):
 @pytest.mark.parametrize("roughness", [-3.0, -1.0])
 def test_a_metal_shows_what_it_mirrors(made, roughness, turn):
     show(made, metallic=6.0, roughness=roughness, albedo=GOLD, turn=turn, lamp=DIM)
-    _, _, fit = mirrored.observe(made.state)
+    _, _, fit = mirrored.fit_both(made.state)
     assert float(fit.seen.float().mean()) > 0.8
-    assert float((fit.ratio[fit.seen] < same_material.METAL).float().mean()) > 0.8
+    assert float((fit.ratio[fit.seen] < same_material.RATIO.metal).float().mean()) > 0.8
     # Photos are rendered at half the light, as by a shorter exposure: so a metal's reflectance is half of its base colour.
     half = torch.tensor(GOLD).sigmoid() / 2
     assert torch.allclose(fit.reflectance[fit.seen].median(dim=0)[0], half, atol=0.06)
@@ -44,15 +45,15 @@ def test_a_metal_shows_what_it_mirrors(made, roughness, turn):
 @pytest.mark.parametrize("albedo", [[1.0, 1.0, 1.0], [2.0, 0.0, -2.0]])
 def test_paint_looks_the_same_from_everywhere(made, albedo):
     show(made, metallic=-6.0, roughness=-1.0, albedo=albedo)
-    _, _, fit = mirrored.observe(made.state)
-    assert float((fit.ratio[fit.seen] > same_material.PAINT).float().mean()) > 0.8
+    _, _, fit = mirrored.fit_both(made.state)
+    assert float((fit.ratio[fit.seen] > same_material.RATIO.paint).float().mean()) > 0.8
 
 
 def test_what_no_photo_shows_is_not_told(made):
     show(made, metallic=6.0, roughness=-1.0)
     state = made.state
     state.photos[:] = [photo._replace(image=torch.full_like(photo.image, 255)) for photo in state.photos]
-    _, seen, fit = mirrored.observe(state)
+    _, seen, fit = mirrored.fit_both(state)
     assert not fit.seen.any() and not seen.weight.any() and seen.pixels.any()
 
 
@@ -207,7 +208,7 @@ def test_the_asset_has_the_doubt_of_the_surfels_that_are_written(made):
 def test_metals_that_are_held_are_not_in_doubt(made):
     show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
     made.state.learned["environment"].data[:] = made.state.learned["environment"].data.mean()
-    put(made, metallic=raw_metallic(metals.HELD["metal"]), held=True)
+    put(made, metallic=raw_metallic(metals.HELD.metal), held=True)
     facts = metals.doubt(made.state)[1]
     assert facts["part"] < 0.002 and "what" not in facts, "only what hardly any pixel shows is"
 
@@ -221,7 +222,7 @@ def test_half_a_mirror_makes_all_of_it_metal(made):
     """Check that the half of a metal ball that was learned as dark paint becomes metal like the rest."""
     show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
     state = made.state
-    shown = mirrored.observe(state)[1].pixels > same_material.FRINGE
+    shown = mirrored.fit_both(state)[1].pixels > same_material.FRINGE
     left = shown & (state.learned["position"][:, 0] < -0.2)
     state.learned["metallic"].data[left] = raw_metallic(0.01)
     half = torch.tensor(GOLD).sigmoid() / 2  # photos are rendered at half the light

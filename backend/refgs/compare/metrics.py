@@ -21,8 +21,7 @@ from skimage.metrics import structural_similarity
 from refgs.color import srgb_decode
 from refgs.compare.pictures import over_white
 from refgs.formats.panorama import directions
-
-COVERED = 0.5  # alpha from which on a pixel belongs to the object
+from refgs.render.rendering import SOLID
 
 SPECK = 0.1  # encoded, from which on a pixel stands out of those about it
 LIGHT_BLUR = 3.0  # degrees, standard deviation
@@ -127,7 +126,7 @@ def normal_mae_degrees(
     The error is 90° where the rendering is almost empty (`alpha` below 0.1) or its normal has length 0. So a rendering cannot lower its
     error by leaving out a part of the object.
     """
-    seen = reference_alpha >= COVERED
+    seen = reference_alpha >= SOLID
     a, b = normals[seen].astype(np.float64), reference[seen].astype(np.float64)
     length = np.linalg.norm(a, axis=-1)
     missing = (length < 1e-6) | (alpha[seen] < 0.1) | ~np.isfinite(length)

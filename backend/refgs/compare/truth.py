@@ -14,6 +14,7 @@ from refgs.errors import InputError
 from refgs.formats.exr import read_exr
 from refgs.formats.mesh import Mesh, read_mesh
 from refgs.formats.panorama import directions, read_environment, sample
+from refgs.render.rendering import SOLID
 
 FOLDER = "ground_truth"  # in a capture that has its own
 PASSES = ("normal", "albedo", "roughness", "metallic", "visibility")
@@ -156,7 +157,7 @@ def errors(images: dict[str, np.ndarray], known: dict[str, np.ndarray], true_alp
     `images` are the rendered maps (see `pictures.maps`), `known` the true ones (see `known_maps`). The error of base colour is not computed
     here, because `metrics.aligned_psnr` compares all views at once. Its input, `metrics.channel_products`, is returned as `albedo`.
     """
-    figures, covered, alpha = {}, true_alpha >= metrics.COVERED, images["alpha"]
+    figures, covered, alpha = {}, true_alpha >= SOLID, images["alpha"]
     for name, true in known.items() if covered.any() else ():
         if name == "normal":
             figures["normal_mae_degrees"] = metrics.normal_mae_degrees(images["normal"], true, alpha, true_alpha)

@@ -2,26 +2,13 @@
 
 from typing import Annotated
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
+from refgs.formats.needs import Found
 from refgs.formats.validate import Finite, Model
 
 Count = Annotated[int, Field(ge=0, le=10**9, strict=True)]
 Seconds = Annotated[Finite, Field(ge=0)]
-
-
-class Decision(Model):
-    """Hold a recorded decision about an optional part of the training. Its figures differ from part to part."""
-
-    model_config = ConfigDict(extra="allow")
-
-    needed: bool
-    why: str
-    seconds: Finite = 0.0
-    megabytes: Finite = 0.0
-    decibels: Finite = 0.0
-    side: Annotated[Finite, Field(ge=0)] = 0.0
-    total: Annotated[Finite, Field(ge=0)] = 0.0
 
 
 class Facts(Model):
@@ -39,5 +26,5 @@ class Facts(Model):
     processor_seconds: Seconds
     decided: dict[str, str]
     clock: dict[str, Finite]
-    needs: dict[str, Decision]
+    needs: dict[str, Found]
     parts: dict[str, dict[str, bool | Count]]

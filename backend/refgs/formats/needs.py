@@ -3,7 +3,7 @@
 from pathlib import PurePosixPath
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, ConfigDict, RootModel, ValidationError, field_validator
+from pydantic import AfterValidator, ConfigDict, Field, RootModel, ValidationError, field_validator
 
 from refgs.formats.validate import Finite, Model
 
@@ -28,6 +28,27 @@ class Pictures(Model):
     view: str
     psnr_on: Finite
     psnr_off: Finite
+
+
+class Found(Model):
+    """Hold the decision about an optional part of a training, as checkpoints keep it.
+
+    `statistic` was compared with `threshold`. Leaving the part out saves `seconds` and `megabytes`, and costs `decibels` of PSNR on the
+    training views. `side` and `total` are what `light` and `iterations` are reduced to. `again` is what the second look at a matte scene
+    found.
+    """
+
+    needed: bool
+    why: str
+    statistic: Finite | None = None
+    threshold: Finite | None = None
+    seconds: Finite | None = None
+    megabytes: Finite | None = None
+    decibels: Finite | None = None
+    side: Annotated[Finite, Field(ge=0)] | None = None
+    total: Annotated[Finite, Field(ge=0)] | None = None
+    again: Finite | None = None
+    pictures: Pictures | None = None
 
 
 class Row(Model):

@@ -15,11 +15,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from refgs.camera import Camera
-from refgs.render.rendering import COVERED, Rendering
+from refgs.render.rendering import COVERED, SOLID, Rendering
 
 REDUCTIONS = 4, 2, 1  # of pictures, from the first steps to the last
 STEPS = 5  # of fitting a pose, for each of these
-SOLID = 0.5  # alpha from which a pixel shows the surface
 ODD = 0.1  # of 1: a difference of colours from which a pixel counts less; it has another cause than the pose
 CHUNK = 1 << 16  # pixels whose equations are held at a time; one takes 700 bytes
 DAMPING = 1e-3  # of the mean diagonal

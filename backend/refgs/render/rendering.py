@@ -7,6 +7,7 @@ from torch import Tensor
 from refgs.color import srgb_decode
 
 COVERED = 1 / 255  # pixels with less alpha than this are background
+SOLID = 0.5  # alpha from which on a pixel shows the surface
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from refgs.train.trainer import Trainer
 WARM, REHEARSED = 5, 25  # iterations: the pace is that from the first to the second
 SCHEDULE = ("train", "light_first"), ("densify", "every"), ("indirect", "every")  # scaled with the iterations
 FASTEST = 2.0  # times a preset's rates
-STEPS, MOST = 64, 2.0  # steps in which settings richer than quick are tried, and how far: standard is at one
+RICHER_STEPS, RICHEST = 64, 2.0  # steps in which settings richer than quick are tried, and how far: standard is at one
 
 
 def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, device: str, report: Report) -> Trainer:
@@ -57,8 +57,8 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
 
     why = f"{plan.minutes:g} minutes were given"
     found, count = quick, iterations(quick)
-    for step in range(1, STEPS + 1):
-        richer = between(quick, standard, MOST * step / STEPS)
+    for step in range(1, RICHER_STEPS + 1):
+        richer = between(quick, standard, RICHEST * step / RICHER_STEPS)
         fit = iterations(richer)
         if fit < richer.train.iterations:
             break

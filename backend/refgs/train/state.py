@@ -11,6 +11,7 @@ from refgs.camera import Camera
 from refgs.capture import Capture, load_views
 from refgs.clock import Clock
 from refgs.events import Report
+from refgs.formats.needs import Found
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.learned import Learned
@@ -63,7 +64,7 @@ class State:
         self.iteration, self.total = 0, self.settings.train.iterations
         self.seconds = 0.0
         self.decided: dict[str, str] = {}  # lines for the artist, by what was decided
-        self.needs: dict[str, dict[str, Any]] = {}  # the decisions of `train/decide`, by the need's name
+        self.needs: dict[str, Found] = {}  # the decisions of `train/decide`, by the need's name
         self.initial = self.method.deferred and self.settings.initial.until > 0  # its stage is not over
         self.residual = False  # the residual learns (see `residual_start`)
         self.learned = Learned()  # surfels, "environment" (raw texels of the light), and "exposure" (one row a view)
@@ -73,6 +74,10 @@ class State:
     def part(self, kind: type[P]) -> P:
         """Return the part of the training of this kind, with its memory (see `train/part.py`)."""
         return self.parts[kind]
+
+    def needed(self, name: str) -> bool:
+        """Tell whether the scene needs an optional part of the training, as far as this is decided (see `train/decide`)."""
+        return name not in self.needs or self.needs[name].needed
 
     @property
     def near(self) -> float:
@@ -188,8 +193,8 @@ def why_not_traced(state: State) -> str:
         return f"shading = {settings.render.shading}"
     if settings.indirect.start >= 1:
         return "its setting leaves it out (indirect.start = 1)"
-    if not state.needs.get("reflections", {}).get("needed", True):
-        return state.needs["reflections"]["why"]
+    if not state.needed("reflections"):
+        return state.needs["reflections"].why
     if settings.render.reflection == "none":
         return "nothing is mirrored"
     if not state.from_hull:  # the mesh would be of the surroundings too

@@ -25,6 +25,7 @@ POSES_FROM, POSES_KNOWN, POSES_UNTIL = (
 )  # parts of the training: poses start to learn, are judged, and are frozen
 WHOLE_EVERY = 8  # iterations: one of these sees its whole photo, so that nothing stays beyond the margin of a crop
 REFLECTING = ("albedo", "metallic", "roughness", "indirect_dc", "indirect_rest", "environment", "exposure")
+PHOTO_STAGES = (0.35, 4), (0.7, 2)  # part of the training until which photos are reduced, and by what factor
 FIRST_LINE, A_DECADE = 10, 10  # of the history: iterations before it, and lines while iterations grow tenfold
 
 
@@ -65,6 +66,10 @@ class Every(NamedTuple):
 
     words: str
     length: Callable[[State], int]
+
+
+ONCE = Every("once", lambda state: 1)
+"""Each iteration: the part itself knows that it is done."""
 
 
 class Row(NamedTuple):
@@ -209,7 +214,7 @@ LIGHT_FIRST = When("iteration `train.light_first`", lambda state, step: step.don
 NOT_ENDED = When("not the last iteration", lambda state, step: step.done < state.total)
 INITIAL = When("the initial stage is not over", lambda state, step: state.initial)
 NOT_INITIAL = When("the initial stage is over", lambda state, step: not state.initial)
-SOLID = When("no opacity reset was just before", lambda state, step: not faint_now(state, step.done))
+OPAQUE = When("no opacity reset was just before", lambda state, step: not faint_now(state, step.done))
 PRUNABLE = When(
     "an opacity reset is long enough past for `densify.prune_opacity`",
     lambda state, step: not faint_now(state, step.done, state.settings.densify.prune_opacity),
@@ -230,11 +235,13 @@ RESTS = When(
 )
 
 BEFORE = (
-    Row("take larger photos"),
-    Row("start the deferred stage", setting("initial.until"), only_if=INITIAL),
-    Row("start the residual", RESIDUAL),
+    Row(
+        "take larger photos", every=Every(", ".join(f"after {until:.0%}" for until, _ in PHOTO_STAGES), lambda state: 1)
+    ),
+    Row("start the deferred stage", setting("initial.until"), every=ONCE, only_if=INITIAL),
+    Row("start the residual", RESIDUAL, every=ONCE),
     Row("set the rates"),
-    Row("refine the light", part(0.2), only_if=LIT),
+    Row("refine the light", part(0.2), every=ONCE, only_if=LIT),
 )
 """Is done before the photo is rendered."""
 
@@ -253,25 +260,33 @@ AFTER = (
     Row("balance the exposures"),
     # Meshes and decisions come before an opacity reset makes all surfels faint. Materials would no longer adapt to a mesh that is made
     # after the residual has started to learn.
-    Row("make a mesh", setting("indirect.start"), RESIDUAL, period("indirect.every"), NOT_INITIAL & NOT_ENDED & SOLID),
+    Row("make a mesh", setting("indirect.start"), RESIDUAL, period("indirect.every"), NOT_INITIAL & NOT_ENDED & OPAQUE),
     Row("decide on inter-reflection", only_if=NEW_MESH, clock="deciding"),
     Row("trace what surfels receive", only_if=NEW_MESH, clock="visibility"),
-    Row("time the crops", iteration(100), only_if=DECIDABLE, clock="deciding"),
+    Row("time the crops", iteration(100), every=ONCE, only_if=DECIDABLE, clock="deciding"),
     Row(
         "look at a matte scene again",
         When("50%", lambda state, step: 2 * step.done >= state.total),
+        every=ONCE,
         only_if=DECIDABLE,
         clock="deciding",
     ),
-    Row("decide on specular shading", part_after_initial(0.05) & iteration(100), only_if=DECIDABLE, clock="deciding"),
-    Row("decide on the light's texels", part_after_initial(0.19), only_if=DECIDABLE, clock="deciding"),
+    Row(
+        "decide on specular shading",
+        part_after_initial(0.05) & iteration(100),
+        every=ONCE,
+        only_if=DECIDABLE,
+        clock="deciding",
+    ),
+    Row("decide on the light's texels", part_after_initial(0.19), every=ONCE, only_if=DECIDABLE, clock="deciding"),
     Row(
         "decide on degrees of harmonics",
         When("70% from `residual.start` to the end", lambda state, step: step.progress >= _late(state, 0.7)),
+        every=ONCE,
         only_if=DECIDABLE,
         clock="deciding",
     ),
-    Row("find metals", part_after_initial(0.1) & iteration(100), RESIDUAL, only_if=METALS, clock="deciding"),
+    Row("find metals", part_after_initial(0.1) & iteration(100), RESIDUAL, ONCE, only_if=METALS, clock="deciding"),
     Row("judge metals", None, RESIDUAL, period("indirect.every"), FROM_HULL & METALS, clock="deciding"),
     Row("even coloured metal out", None, part(0.6), iterations(50)),
     Row("prune and divide surfels", setting("densify.start"), None, period("densify.every"), PRUNABLE),
@@ -286,8 +301,8 @@ AFTER = (
         every=period("densify.reset_every"),
         only_if=When("before `densify.stop`, normals are not propagated", _resets),
     ),
-    Row("leave out exposures that agree", part(0.3), None, period("densify.every"), NOT_INITIAL & SOLID),
-    Row("judge the poses", part(POSES_KNOWN)),
+    Row("leave out exposures that agree", part(0.3), None, period("densify.every"), NOT_INITIAL & OPAQUE),
+    Row("judge the poses", part(POSES_KNOWN), every=ONCE),
 )
 """Is done after Adam's step."""
 

@@ -3,8 +3,7 @@
 The first stage shades each surfel, before blending. The second stage shades each pixel, after blending.
 """
 
-from typing import Any
-
+from refgs.formats.needs import Found
 from refgs.train.decide.need import ASKED, Decision, Moment, Need
 from refgs.train.learn.coarse import cost
 from refgs.train.state import State
@@ -24,8 +23,8 @@ class Initial(Need):
     def measure(self, state: State) -> Decision:
         return Decision(False, ASKED if self.asked(state) == "off" else "surfels start on the hull of the masks")
 
-    def apply(self, state: State, found: dict[str, Any]) -> None:
-        state.change("initial.until", 0.0, "needs", found["why"])
+    def apply(self, state: State, found: Found) -> None:
+        state.change("initial.until", 0.0, "needs", found.why)
         state.initial = False
 
 
@@ -40,25 +39,27 @@ class Iterations(Need):
     ENOUGH = 0.8  # part of the iterations left after which matte scenes are as good as after all: docs/notebook/needs-and-minutes.md
 
     def due(self, state: State, moment: Moment) -> bool:
-        matte = not state.needs.get("specular", {"needed": True})["needed"]
+        matte = not state.needed("specular")
         asked = moment == "start" and self.asked(state) == "off"
         return (asked or matte) and state.plan.minutes is None
 
     def measure(self, state: State, done: int = 0) -> Decision:
-        specular = state.needs.get("specular", {})
+        specular = state.needs.get("specular")
         total = done + round(self.ENOUGH * (state.total - done))
         left, why = 0.0, ASKED  # seconds
-        if "statistic" in specular:
+        statistic = threshold = None
+        if specular and specular.statistic is not None:
+            statistic, threshold = specular.statistic, specular.threshold
             to_come = cost(state, done, state.total) / max(cost(state, 0, done), 1e-9)
-            left = state.seconds * to_come - specular["seconds"]
+            left = state.seconds * to_come - specular.seconds
             why = "what mirrors nothing has less to learn"
         figures = {"total": total, "seconds": max(left, 0.0) * (1 - self.ENOUGH)}
         why = f"{why}: {total:,} in place of {state.total:,}"
-        return Decision(False, why, figures, specular.get("statistic"), specular.get("threshold"))
+        return Decision(False, why, figures, statistic, threshold)
 
-    def apply(self, state: State, found: dict[str, Any]) -> None:
-        state.total = min(state.total, int(found["total"]))
-        state.effective = state.effective.noted("train.iterations", state.total, "needs", found["why"])
+    def apply(self, state: State, found: Found) -> None:
+        state.total = min(state.total, int(found.total))
+        state.effective = state.effective.noted("train.iterations", state.total, "needs", found.why)
 
     def undo(self, state: State, why: str) -> None:
         state.total = state.settings.train.iterations

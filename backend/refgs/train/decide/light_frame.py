@@ -11,16 +11,16 @@ from refgs.geometry.project import inside, project, sample
 from refgs.model import harmonics
 from refgs.model.environment import turn_between
 
-SIDE = 96  # pixels: the hull is not the object in finer detail
+PHOTO_SIDE = 96  # pixels: the hull is not the object in finer detail
 POINTS = 2000
-FACING = 0.3  # cosine to the camera above which a point is used
+FRONTAL = 0.3  # cosine to the camera above which a point is used
 BEHIND = 0.1  # scene radii behind the foremost point at which a point is hidden
 DEGREE = 3  # of the harmonics
-DARK = 0.01  # radiance that is added, so that black has a logarithm
+FLOOR = 0.01  # radiance that is added, so that black has a logarithm
 FOLDS = 4
 FEWEST = 3  # photos of a point that tell its own brightness
-RIDGE = 1e-4
-SWEEPS = 4
+PENALTY = 1e-4
+PASSES = 4
 LESS = 0.95  # of the error under a still light: the light turns only where it explains clearly more
 
 
@@ -58,17 +58,17 @@ def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.nd
     which model the radiance: the first under a light that stands still, the second under a light that turns with the camera.
     """
     some = np.arange(0, len(positions), max(1, len(positions) // POINTS))
-    coarse = int(np.clip(0.75 * np.sqrt(len(positions)), 16, SIDE))  # coarse enough that points leave no holes
+    coarse = int(np.clip(0.75 * np.sqrt(len(positions)), 16, PHOTO_SIDE))  # coarse enough that points leave no holes
     reference, rows = views[0].camera, []
     for number, view in enumerate(views):
-        camera = view.camera.fitted(SIDE)
+        camera = view.camera.fitted(PHOTO_SIDE)
         shown = cv2.resize(view.image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         radiance = srgb_decode(shown.astype(np.float32) / view.white).mean(axis=-1)
         ahead, behind = _visibility(camera.fitted(coarse), positions, some)
         towards = camera.position - positions[some]
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         cosine = (normals[some] * towards).sum(axis=1)
-        seen = np.flatnonzero(ahead & (cosine > FACING) & (behind < BEHIND * radius))
+        seen = np.flatnonzero(ahead & (cosine > FRONTAL) & (behind < BEHIND * radius))
         normal = normals[some][seen]
         mirrored = 2 * cosine[seen, None] * normal - towards[seen]
         turn = turn_between(camera, reference)
@@ -77,7 +77,7 @@ def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.nd
             (
                 seen,
                 np.full(len(seen), number),
-                np.log(sample(radiance, pixels, clamp=True).astype(np.float64) + DARK),
+                np.log(sample(radiance, pixels, clamp=True).astype(np.float64) + FLOOR),
                 _harmonics(mirrored),
                 np.concatenate([_harmonics(normal @ turn.T), _harmonics(mirrored @ turn.T)], axis=1),
             )
@@ -119,12 +119,12 @@ def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray,
         asked = ~known & often[points]
         columns = np.column_stack([values, terms])
         of_photo = np.zeros((photos.max() + 1, columns.shape[1]))
-        for _ in range(SWEEPS):  # means of points and of photos, one after the other
+        for _ in range(PASSES):  # means of points and of photos, one after the other
             of_point = _means(columns[known] - of_photo[photos[known]], points[known], points.max() + 1)
             of_photo = _means(columns[known] - of_point[points[known]], photos[known], photos.max() + 1)
         columns = columns - of_point[points] - of_photo[photos]  # zero so far for the photos to predict
         y, x = columns[:, 0], columns[:, 1:]
-        normal = x[known].T @ x[known] + RIDGE * known.sum() * np.eye(x.shape[1])
+        normal = x[known].T @ x[known] + PENALTY * known.sum() * np.eye(x.shape[1])
         error = (y - x @ np.linalg.solve(normal, x[known].T @ y[known]))[asked]
         error -= _means(error[:, None], photos[asked], photos.max() + 1)[photos[asked], 0]
         total, count = total + float(error @ error), count + len(error)

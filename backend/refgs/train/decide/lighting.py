@@ -1,10 +1,10 @@
 """Decide whether a scene needs inter-reflection, the light's full resolution, and all degrees of spherical harmonics."""
 
 import math
-from typing import Any
 
 import torch
 
+from refgs.formats.needs import Found
 from refgs.model.prefilter import IRRADIANCE_SIDE
 from refgs.train import probe
 from refgs.train.decide.materials import INDIRECT
@@ -58,7 +58,7 @@ class Reflections(Need):
         seconds, size = probe.seconds_saved(state, without), megabytes(state, INDIRECT)
         return {"seconds": seconds, "decibels": probe.psnr_loss(state, without).whole, "megabytes": size}
 
-    def apply(self, state: State, found: dict[str, Any]) -> None:
+    def apply(self, state: State, found: Found) -> None:
         state.occluder = None
         state.learned.drop(*INDIRECT)
 
@@ -113,8 +113,8 @@ class Light(Need):
         figures |= {"megabytes": 6 * (finest**2 - side**2) * 3 * NUMBER / MEGA, "decibels": loss.whole}
         return Decision(False, why, figures, roughness, least, lambda: light.coarsen(state, side))
 
-    def apply(self, state: State, found: dict[str, Any]) -> None:
-        state.change("environment.resolution", int(found["side"]), "needs", found["why"])
+    def apply(self, state: State, found: Found) -> None:
+        state.change("environment.resolution", int(found.side), "needs", found.why)
 
     def undo(self, state: State, why: str) -> None:
         state.change("environment.resolution", state.effective.asked.environment.resolution, "needs", why)

@@ -1,18 +1,19 @@
 """Decide whether a scene needs specular shading, and whether splats.ply needs columns for metallic and roughness."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
+from refgs.formats.needs import Found
 from refgs.model.surfels import Surfels
 from refgs.train import probe
 from refgs.train.decide.need import ASKED, MEGA, Decision, Moment, Need, megabytes
-from refgs.train.material import changes, metals
+from refgs.train.material import metals
+from refgs.train.material.changes import change_seen
+from refgs.train.material.observe import observe_changes
 from refgs.train.start import start_appearance
 from refgs.train.state import RenderInputs, State, why_not_traced
 
-CHANGES = 0.042  # of 1; matte clay has 0.037, an embossed gold cape in flat light 0.056, a mirror 0.2
+SHINES = 0.042  # of 1; matte clay has 0.037, an embossed gold cape in flat light 0.056, a mirror 0.2
 SMALL_PART = 1.0  # dB of a small part (`probe.PART`); matte clay has -1.2, a clay pig with a chrome bell 1.7
 RARE = 1e-3  # part of the pictures, at either end, whose surfels do not count for a common value
 INDIRECT = "indirect_dc", "indirect_rest", "received"
@@ -44,17 +45,17 @@ class Specular(Need):
         if explained.part >= SMALL_PART:
             return Decision(True, why, statistic=explained.part, threshold=SMALL_PART)
         # Normals are not right yet, and an embossed metal has no sharp reflections: it explains nothing, and yet it shines.
-        change = changes.change_seen(changes.observe(state), state.wanted())
+        change = change_seen(observe_changes(state), state.wanted())
         why += f"; colours change with the view by {change:.3f} of 1"
-        if change >= CHANGES:
-            return Decision(True, why, statistic=change, threshold=CHANGES)
+        if change >= SHINES:
+            return Decision(True, why, statistic=change, threshold=SHINES)
         saved = probe.seconds_saved(state, probe.without_specular)
         size = megabytes(state, ("metallic", "roughness", *INDIRECT))
         figures = {"seconds": saved, "megabytes": size, "decibels": explained.whole}
         return Decision(False, why, figures, explained.whole)
 
-    def apply(self, state: State, found: dict[str, Any]) -> None:
-        state.change("render.reflection", "none", "needs", found["why"])
+    def apply(self, state: State, found: Found) -> None:
+        state.change("render.reflection", "none", "needs", found.why)
         state.occluder = None
         state.learned.drop("metallic", "roughness", "held", *INDIRECT)
 
@@ -68,12 +69,12 @@ class Specular(Need):
 
         Returns the decision to bring specular shading back if colours change with the view after all.
         """
-        found = state.needs.get(self.name, {"needed": True})
-        if found["needed"] or "statistic" not in found or "again" in found:
+        if state.needed(self.name) or (found := state.needs[self.name]).statistic is None or found.again is not None:
             return None
-        change = found["again"] = changes.change_seen(changes.observe(state), state.wanted())
+        change = change_seen(observe_changes(state), state.wanted())
+        state.needs[self.name] = found.model_copy(update={"again": change})
         why = f"halfway, colours change with the view by {change:.3f} of 1: it was taken for matte before"
-        return Decision(True, why, statistic=change, threshold=CHANGES) if change >= CHANGES else None
+        return Decision(True, why, statistic=change, threshold=SHINES) if change >= SHINES else None
 
 
 def _learn_again(state: State, names: list[str]) -> None:

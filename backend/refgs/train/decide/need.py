@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple
 
+from refgs.formats.needs import Found
 from refgs.train.state import State
 
 Moment = Literal["photos", "start", "specular", "light", "degrees", "mesh", "asset"]
@@ -59,7 +60,7 @@ class Need:
         """
         raise NotImplementedError
 
-    def apply(self, state: State, found: dict[str, Any]) -> None:
+    def apply(self, state: State, found: Found) -> None:
         """Leave out this optional part of the training, after it was found not to be needed.
 
         It is called once after the decision, and again when a run is resumed. `found` is the recorded decision.

@@ -8,6 +8,7 @@ iterations.
 import json
 from typing import Any
 
+from refgs.formats.needs import Found
 from refgs.paths import write_text
 from refgs.train.decide.iterations import Initial, Iterations
 from refgs.train.decide.lighting import Degrees, Light, Reflections, share_hidden
@@ -89,8 +90,7 @@ def look_again(state: State, step: Step) -> None:
 
 def bring_back_specular(state: State, why: str) -> bool:
     """Bring specular shading back, with all that was left out with it, as `why` says. Returns False if a setting left it out."""
-    found = state.needs.get(SPECULAR.name, {"needed": True})
-    if found["needed"] or SPECULAR.asked(state) != "auto":
+    if state.needed(SPECULAR.name) or SPECULAR.asked(state) != "auto":
         return False
     _bring_back_specular(state, Decision(True, why))
     return True
@@ -102,7 +102,7 @@ def _bring_back_specular(state: State, decision: Decision) -> None:
     _undo_following(state, state.needs, decision.why)
 
 
-def _undo_following(state: State, decisions: dict[str, dict[str, Any]], why: str) -> None:
+def _undo_following(state: State, decisions: dict[str, Found], why: str) -> None:
     """Take back those of the `decisions` that followed from the one on specular shading, if no setting asked for them."""
     for need in NEEDS:
         if need.follows == SPECULAR.name and need.name in decisions and need.asked(state) == "auto":
@@ -118,33 +118,33 @@ def reflections(state: State, step: Step) -> None:
 
 def _record(state: State, need: Need, decision: Decision) -> None:
     """Record a decision about an optional part of the training, and report it. Leave the part out if it is not needed."""
-    found: dict[str, Any] = {"needed": decision.needed, "why": decision.why}
+    figures = {key: float(value) for key, value in decision.figures.items()}
     if decision.statistic is not None:
-        found["statistic"] = float(decision.statistic)
-        found["threshold"] = float(need.threshold if decision.threshold is None else decision.threshold)
-    found |= {key: float(value) for key, value in decision.figures.items()}
-    if decision.statistic is not None and (pictures := write_pictures(state, need.name, found)):
-        found["pictures"] = pictures
+        threshold = need.threshold if decision.threshold is None else decision.threshold
+        figures = {"statistic": float(decision.statistic), "threshold": float(threshold)} | figures
+    found = Found(needed=decision.needed, why=decision.why, **figures)
+    if decision.statistic is not None:
+        found = found.model_copy(update={"pictures": write_pictures(state, need.name, found)})
     state.needs[need.name] = found
-    if "pictures" in found:
+    if found.pictures:
         write_text(state.folder / "needs.json", json.dumps(rows(state), indent=1))
     state.announce(need.name, f"{'with' if decision.needed else 'without'} {need.what}: {decision.why}")
     if not decision.needed:
         decision.once()
-        need.apply(state, state.needs[need.name])
+        need.apply(state, found)
 
 
-def restore(state: State, recorded: dict[str, dict[str, Any]]) -> None:
+def restore(state: State, recorded: dict[str, Found]) -> None:
     """Take over the decisions of a checkpoint, and leave out again the parts of the training that were not needed.
 
     `recorded` are the checkpoint's decisions by name. If the training goes back to an earlier checkpoint, later decisions stay.
     """
     before, now = (decisions.get(SPECULAR.name) for decisions in (recorded, state.needs))
-    if before and now and now["needed"] and not before["needed"]:  # taken back after this checkpoint
-        _undo_following(state, recorded, now["why"])
+    if before and now and now.needed and not before.needed:  # taken back after this checkpoint
+        _undo_following(state, recorded, now.why)
     state.needs = recorded | state.needs
     for name, found in state.needs.items():
-        if not found["needed"]:
+        if not found.needed:
             BY_NAME[name].apply(state, found)
 
 
@@ -152,9 +152,9 @@ def rows(state: State) -> list[dict[str, Any]]:
     """Return the decisions about optional parts of the training, as rows for needs.json."""
     listed = []
     for name, found in state.needs.items():
-        row = {"need": name, "what": BY_NAME[name].what, **found}
-        if not found["needed"]:
-            row["saved"] = f"{found.get('seconds', 0):.1f} s, {found.get('megabytes', 0):.1f} MB"
-            row |= {"cost": f"{found['decibels']:+.3f} dB"} if "decibels" in found else {}
+        row = {"need": name, "what": BY_NAME[name].what, **found.model_dump(exclude_none=True)}
+        if not found.needed:
+            row["saved"] = f"{found.seconds or 0:.1f} s, {found.megabytes or 0:.1f} MB"
+            row |= {} if found.decibels is None else {"cost": f"{found.decibels:+.3f} dB"}
         listed.append(row)
     return listed

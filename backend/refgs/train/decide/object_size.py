@@ -9,8 +9,8 @@ from refgs.settings import SurfelSettings
 from refgs.train.photo import bounds
 from refgs.train.state import State, spread
 
-VIEWS = 24  # that are looked at, at the most
-LEAST = 2  # times as many surfels as at the start are allowed, however small the object is
+SIZE_VIEWS = 24  # that are looked at, at the most
+LEAST_GROWTH = 2  # times as many surfels as at the start are allowed, however small the object is
 
 
 class ObjectSize(NamedTuple):
@@ -29,7 +29,7 @@ def object_size(state: State) -> ObjectSize:
     if not state.from_hull:
         return ObjectSize(0.0, 0.0)
     spans, areas, capture = [], [], state.capture
-    for view in spread(state.views, VIEWS):
+    for view in spread(state.views, SIZE_VIEWS):
         rows, columns = bounds(view.alpha, 0)
         span, area = max(rows.stop - rows.start, columns.stop - columns.start), np.count_nonzero(view.alpha > 127)
         if capture.box is not None:
@@ -45,7 +45,7 @@ def surfel_budget(settings: SurfelSettings, area: float) -> int:
     """Return how many surfels an object of `area` pixels in a photo gets at the most: `density` a pixel, but no more than `budget`."""
     if settings.density == 0:
         return settings.budget
-    return min(settings.budget, max(LEAST * settings.start, round(settings.density * area)))
+    return min(settings.budget, max(LEAST_GROWTH * settings.start, round(settings.density * area)))
 
 
 def limit_surfels(state: State, area: float) -> None:

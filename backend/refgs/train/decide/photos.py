@@ -65,8 +65,9 @@ def time_crops(state: State, step: Step) -> None:
 
     This is done once.
     """
-    if state.crops is not None and "seconds" not in state.needs["outside"]:
-        state.needs["outside"]["seconds"] = (1 - 1 / WHOLE_EVERY) * probe.seconds_saved(state, whole=True)
+    if state.crops is not None and state.needs["outside"].seconds is None:
+        seconds = (1 - 1 / WHOLE_EVERY) * probe.seconds_saved(state, whole=True)
+        state.needs["outside"] = state.needs["outside"].model_copy(update={"seconds": seconds})
 
 
 def duplicate_views(views: list[LoadedView], radius: float) -> list[int]:

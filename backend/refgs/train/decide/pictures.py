@@ -13,18 +13,19 @@ import torch
 from torch import Tensor
 
 from refgs.compare.pictures import write_png
+from refgs.formats.needs import Found, Pictures
 from refgs.train import probe
 from refgs.train.state import RenderInputs, State
 
-FOLDER = "needs"  # in the run folder
-SIDE = 320  # pixels of a picture on its longer side: a panel shows no more
+PICTURES = "needs"  # in the run folder
+SHOWN_SIDE = 320  # pixels of a picture on its longer side: a panel shows no more
 
-Pair = Callable[[State, dict[str, Any], list[int]], Iterator[tuple[Tensor, Tensor]]]
+Pair = Callable[[State, Found, list[int]], Iterator[tuple[Tensor, Tensor]]]
 """Renders views with a part and without it: encoded pictures (H, W, 3). The second argument is the recorded decision."""
 
 
 @torch.no_grad()
-def write_pictures(state: State, name: str, found: dict[str, Any]) -> dict[str, Any] | None:
+def write_pictures(state: State, name: str, found: Found) -> Pictures | None:
     """Write pictures of both answers to the need `name`, and of the photo, for the view in which the answers differ most.
 
     `found` is the recorded decision. Returns the view's name, the files' paths in the run folder, and the PSNR of both pictures of this
@@ -44,29 +45,29 @@ def write_pictures(state: State, name: str, found: dict[str, Any]) -> dict[str, 
     truth = photo.over(state.background)
     written: dict[str, Any] = {"view": photo.camera.name}
     for kind, picture in zip(("on", "off", "photo"), (*pair, truth), strict=True):
-        written[kind] = f"{FOLDER}/{name}_{kind}.png"
+        written[kind] = f"{PICTURES}/{name}_{kind}.png"
         write_png(state.folder / written[kind], _reduced(picture))
         if kind != "photo":
             written[f"psnr_{kind}"] = -10 * math.log10(max(float((picture - truth).square().mean()), 1e-12))
-    return written
+    return Pictures(**written)
 
 
 def _reduced(picture: Tensor) -> np.ndarray:
-    """Return an encoded picture (H, W, 3) as uint8, at most SIDE pixels on its longer side."""
+    """Return an encoded picture (H, W, 3) as uint8, at most SHOWN_SIDE pixels on its longer side."""
     pixels = np.rint(255 * picture.numpy(force=True)).astype(np.uint8)
-    scale = SIDE / max(pixels.shape[:2])
+    scale = SHOWN_SIDE / max(pixels.shape[:2])
     if scale >= 1:
         return pixels
     size = [max(1, round(side * scale)) for side in pixels.shape[1::-1]]
     return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
-def _specular(state: State, found: dict[str, Any], views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
+def _specular(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
     """Render what is mirrored, and the same as if it did not change with the view."""
     return probe.mirrored_and_mean(state, state.inputs(), views)
 
 
-def _reflections(state: State, found: dict[str, Any], views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
+def _reflections(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
     """Render the object's mean radiance where it hides the light from what mirrors it, and the light everywhere.
 
     What the object mirrors of itself is not known before it is traced.
@@ -87,12 +88,12 @@ def _mean_radiance(state: State, inputs: RenderInputs, views: list[int]) -> Tens
     return torch.stack([radiance.mean(dim=0) for radiance in shown if len(radiance)]).mean(dim=0)
 
 
-def _light(state: State, found: dict[str, Any], views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
+def _light(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
     """Render under the light, and under the coarser one that was chosen in its place."""
     inputs = state.inputs()
-    if found["needed"] or inputs.settings.reflection == "none":
+    if found.needed or inputs.settings.reflection == "none":
         return
-    coarse = inputs._replace(environment=probe.pooled(inputs.environment, int(found["side"])))
+    coarse = inputs._replace(environment=probe.pooled(inputs.environment, int(found.side)))
     for view in views:
         yield tuple(probe.picture(state, view, way).color for way in (inputs, coarse))
 

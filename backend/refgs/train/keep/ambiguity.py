@@ -12,7 +12,7 @@ from refgs.model.surfels import Surfels
 from refgs.train.learn.exposures import exposure
 from refgs.train.state import RenderInputs, State
 
-VIEWS = 6  # at the most
+TRADE_VIEWS = 6  # at the most
 SMALL = 0.02  # part of a change over which its derivative is taken
 UNSEEN = 0.25  # of the pictures' own error: a smaller change adds at most 6 % to its square
 
@@ -98,7 +98,7 @@ def ambiguities(state: State) -> dict[str, dict]:
     light = state.environment()
     if light is None:
         return {}
-    chosen = range(0, len(state.views), max(1, -(-len(state.views) // VIEWS)))
+    chosen = range(0, len(state.views), max(1, -(-len(state.views) // TRADE_VIEWS)))
     with torch.no_grad():
         now = state.surfels(), light.radiance
         before = [*_pictures(state, now, chosen)]

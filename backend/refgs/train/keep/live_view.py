@@ -9,7 +9,7 @@ from refgs.model.surfels import to_splats
 from refgs.render.volume import with_normals_last
 from refgs.train.state import State
 
-FOLDER = "preview"  # in the run folder
+PREVIEW = "preview"  # in the run folder
 
 
 def write_preview(state: State) -> dict[str, str | int]:
@@ -17,7 +17,7 @@ def write_preview(state: State) -> dict[str, str | int]:
 
     Each file is written whole or not at all. Returns the two paths and the iteration.
     """
-    folder = state.folder / FOLDER
+    folder = state.folder / PREVIEW
     view = (state.test or state.views)[0]
     with torch.no_grad():
         wanted = state.wanted()

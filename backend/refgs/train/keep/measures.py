@@ -17,12 +17,12 @@ from refgs.render.renderer import Rendering, render
 from refgs.run import light_of
 from refgs.train.state import State, spread
 
-VIEWS = 4  # that are measured
-FEWER = 2  # of them for what is slow: FLIP, which takes as long as ten renderings, and relighting
+MEASURED_VIEWS = 4  # that are measured
+SLOW_VIEWS = 2  # of them for what is slow: FLIP, which takes as long as ten renderings, and relighting
 ROWS = 128  # of the lights that are compared
 
 
-def held_out_psnr(state: State, most: int = VIEWS) -> float | None:
+def held_out_psnr(state: State, most: int = MEASURED_VIEWS) -> float | None:
     """Average the PSNR over at most `most` of the held-out views. Return None if there are no held-out views."""
     chosen = spread(state.test, most)
     if not chosen:
@@ -54,7 +54,7 @@ class Measures:
         capture = state.capture
         self.settings, self._background = state.settings, torch.tensor(state.settings.image.background)
         self._method = state.method
-        chosen = spread(list(zip(capture.test_views, state.test, strict=True)), VIEWS)
+        chosen = spread(list(zip(capture.test_views, state.test, strict=True)), MEASURED_VIEWS)
         folder = capture.folder / FOLDER
         self._light = self._panorama = None
         try:
@@ -118,8 +118,8 @@ class Measures:
         return found
 
     def flip(self, state: State) -> dict[str, float]:
-        """Average the image error FLIP over the first FEWER held-out views. Returns it under the name `flip_test`."""
-        chosen = self._test_views[:FEWER]
+        """Average the image error FLIP over the first SLOW_VIEWS held-out views. Returns it under the name `flip_test`."""
+        chosen = self._test_views[:SLOW_VIEWS]
         values = [self._against_photo(metrics.flip, state.render(test.view.camera), test) for test in chosen]
         return {"flip_test": float(np.mean(values))} if values else {}
 
@@ -131,14 +131,14 @@ class Measures:
 
     @torch.no_grad()
     def _relit(self, state: State) -> float:
-        """Render the first FEWER held-out views under another light, and return the PSNR against their true pictures.
+        """Render the first SLOW_VIEWS held-out views under another light, and return the PSNR against their true pictures.
 
         One factor first scales all renderings to fit the truth best.
         """
         settings = self.settings.render.model_copy(update={"reflection": "microfacet"})
         surfels = state.surfels().without_directions()
         pairs = []
-        for test in self._test_views[:FEWER]:
+        for test in self._test_views[:SLOW_VIEWS]:
             given = test.view.camera, state.background, settings, state.near
             image = render(surfels, self._light, *given)
             pairs.append((maps(image)["color"], test.relit))

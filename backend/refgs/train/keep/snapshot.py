@@ -19,7 +19,10 @@ def save(state: State) -> None:
         tensors |= {f"{part.name}.{name}": value for name, value in part.tensors(state).items()}
     facts = {"seconds": state.seconds, "total": state.total, "initial": state.initial, "residual": state.residual}
     facts |= {"clock": state.clock.seconds, "spent": state.plan.spent, "processor_seconds": state.clock.processor}
-    facts |= {"decided": state.decided, "needs": state.needs}
+    facts |= {
+        "decided": state.decided,
+        "needs": {name: found.model_dump(exclude_none=True) for name, found in state.needs.items()},
+    }
     facts["parts"] = {part.name: found for part in state.parts.values() if (found := part.facts(state))}
     checkpoint.save(state.folder / "checkpoints", state.iteration, tensors, facts)
 
@@ -33,7 +36,7 @@ def restore(state: State, run: Path) -> None:
     facts = validated(tables, Facts, str(run / "checkpoints"), "Train again into a new folder.")
     _check_tensors(tensors, run)
     state.total = facts.total
-    needs.restore(state, {name: found.model_dump(exclude_unset=True) for name, found in facts.needs.items()})
+    needs.restore(state, facts.needs)
     tensors = {name: value.to(state.device) for name, value in tensors.items()}
     state.iteration, state.seconds = facts.iteration, facts.seconds
     state.clock.resume(facts.clock, facts.processor_seconds)

@@ -12,9 +12,8 @@ from refgs.train.part import Fact, Part
 from refgs.train.photo import MARGIN, Crop, Photo, bounds
 from refgs.train.plan import FULL, Stage, iterations_time, stage_at
 from refgs.train.state import State
-from refgs.train.timeline import POSES_KNOWN, Step
+from refgs.train.timeline import PHOTO_STAGES, POSES_KNOWN, Step
 
-STAGES = (0.35, 4), (0.7, 2)  # part of the training until which photos are reduced, and by what factor
 LEAST_SPAN = 200  # pixels of the object in reduced photos
 
 
@@ -41,7 +40,7 @@ class Coarse(Part):
 
 def stages(pixels: float) -> tuple[Stage, ...]:
     """Plan the stages of a training of an object that spans so many `pixels` in the full photos."""
-    return *(Stage(*stage) for stage in STAGES if pixels / stage[1] >= LEAST_SPAN), *FULL
+    return *(Stage(*stage) for stage in PHOTO_STAGES if pixels / stage[1] >= LEAST_SPAN), *FULL
 
 
 def begin(state: State, pixels: float, refined: bool) -> None:

@@ -16,8 +16,8 @@ from refgs.train.start import AROUND
 from refgs.train.state import State
 from refgs.train.timeline import DIVIDE, RESET, Step
 
-FEWER = 0.8  # of the surfels, where there is no memory for all
-LEAST_SURFELS = 1000
+KEPT = 0.8  # of the surfels, where there is no memory for all
+LEAST_LEFT = 1000
 
 
 class Densification(Part):
@@ -128,12 +128,12 @@ def full_card() -> TryAgain:
 
 
 def fewer_surfels(state: State) -> None:
-    """Keep only the most opaque surfels, the fraction FEWER of all, because the graphics card's memory is full.
+    """Keep only the most opaque surfels, the fraction KEPT of all, because the graphics card's memory is full.
 
-    The surfel budget is lowered to the same number. Raises TryAgain if fewer than LEAST_SURFELS would be left.
+    The surfel budget is lowered to the same number. Raises TryAgain if fewer than LEAST_LEFT would be left.
     """
-    budget = int(FEWER * state.learned.count)
-    if budget < LEAST_SURFELS:
+    budget = int(KEPT * state.learned.count)
+    if budget < LEAST_LEFT:
         raise full_card()
     state.learned.forget_gradients()
     torch.cuda.empty_cache()

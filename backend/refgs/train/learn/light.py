@@ -16,6 +16,7 @@ from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render.channels import channels
 from refgs.render.rasterize import rasterize
+from refgs.render.rendering import SOLID
 from refgs.render.shade import mirror_directions
 from refgs.render.stack import stack
 from refgs.render.volume import discs
@@ -24,13 +25,12 @@ from refgs.train.part import Fact, Part
 from refgs.train.state import State
 from refgs.train.timeline import Step
 
-LEAST = 16  # texels along a side
+LEAST_SIDE = 16  # texels along a side
 DIFFUSED = (
     64  # texels along a side at which `environment.diffusion` holds; it reaches as far on the sphere at other sides
 )
-VIEWS = 24  # that say which part of the light the object mirrors
-PART = 16  # texels along a side of the cubemap that says which directions are mirrored
-SOLID = 0.5  # alpha
+MIRROR_VIEWS = 24  # that say which part of the light the object mirrors
+MIRROR_SIDE = 16  # texels along a side of the cubemap that says which directions are mirrored
 
 
 class MirroredLight(Part):
@@ -58,7 +58,7 @@ def first_resolution(settings: Settings) -> int:
 
     It is half the final resolution: each texel is then seen more often and learns sooner.
     """
-    return max(settings.environment.resolution // 2, LEAST)
+    return max(settings.environment.resolution // 2, LEAST_SIDE)
 
 
 @torch.no_grad()
@@ -112,7 +112,7 @@ def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
         return None
     mirrors = state.part(MirroredLight)
     if mirrors.weight is None or len(mirrors.weight) != len(light.radiance):
-        cameras = state.spread_cameras(VIEWS)
+        cameras = state.spread_cameras(MIRROR_VIEWS)
         with torch.no_grad():
             mirrors.weight = mirrored(state.surfels(), cameras, light, state.settings.render, state.near)
     return mirrors.weight @ light.radiance
@@ -127,7 +127,7 @@ def mirrored(
     that a few pixels mirror could otherwise take any colour to make the mean grey. If no texel is mirrored, all texels are weighted by
     their solid angles. Surfels nearer to a camera than `near` are not drawn.
     """
-    pixels = torch.zeros(6 * PART * PART)
+    pixels = torch.zeros(6 * MIRROR_SIDE * MIRROR_SIDE)
     settings = settings.model_copy(update={"reflection": "microfacet"})  # treat matte surfaces as reflective here
     for camera in cameras:
         lit = stack(channels(surfels, camera, settings, indirect=True))
@@ -143,7 +143,7 @@ def mirrored(
 
 
 def _texels_at(directions: Tensor) -> Tensor:
-    """Return the indices of the texels that lie in the directions (P, 3), on a coarse cubemap with PART texels along a side."""
+    """Return the indices of the texels that lie in the directions (P, 3), on a coarse cubemap with MIRROR_SIDE texels along a side."""
     face, s, t = cubemap.face_coordinates(directions)
-    column, row = (((x + 1) / 2 * PART).long().clamp(0, PART - 1) for x in (s, t))
-    return (face * PART + row) * PART + column
+    column, row = (((x + 1) / 2 * MIRROR_SIDE).long().clamp(0, MIRROR_SIDE - 1) for x in (s, t))
+    return (face * MIRROR_SIDE + row) * MIRROR_SIDE + column

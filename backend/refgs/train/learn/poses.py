@@ -23,7 +23,7 @@ from refgs.train.part import Fact, Part
 from refgs.train.state import State
 from refgs.train.timeline import POSES_FROM, POSES_KNOWN, Step
 
-MOST = 0.02  # of a step: radians, and scene radii
+LONGEST_STEP = 0.02  # of a step: radians, and scene radii
 SAMPLE = 1000  # surfels whose shift in the photos is measured
 EXACT = 0.3  # pixels between features and their epipolar lines: poses with less are exact; four real captures have 0.1
 BETTER = 0.5  # of the given poses' distance, below which the refined ones must come
@@ -94,7 +94,7 @@ def refine(state: State, step: Step) -> None:
     reduction = max(reduction // state.part(coarse.Coarse).factor, 1)  # the photo may be reduced already
     found = pose_step(step.rendering, photo.over(state.background), photo.camera, centre, radius, reduction)
     if found.isfinite().all():
-        poses.values[step.view] += found.clamp(-MOST, MOST)
+        poses.values[step.view] += found.clamp(-LONGEST_STEP, LONGEST_STEP)
         poses.move(state, step.view)
 
 

@@ -18,20 +18,19 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.capture import load_depth, load_normals
 from refgs.capture.poses import split_similarity
-from refgs.render.rendering import Rendering
+from refgs.render.rendering import SOLID, Rendering
 from refgs.train.part import Part
 from refgs.train.photo import Photo
 from refgs.train.state import State, spread
 from refgs.train.timeline import Step
 
 FADED = 0.6  # part of the training after which priors have no weight
-VIEWS = 16  # that are looked at to find what the files mean, at the most
+PRIOR_VIEWS = 16  # that are looked at to find what the files mean, at the most
 OUTLINE = 80  # part of a photo's side that counts as near an outline
 AGREES = 0.35  # least correlation across the view, near outlines: of a bowl 0.58, with 15° of noise 0.48; of other scenes' normals 0.32
 WRONG = 0.5  # 1 − cosine of a normal that is as likely wrong as the surface: its pull is a quarter
 FAR = 0.1  # distance, in scene radii, of a depth that is as likely wrong as the surface
 ROUNDS = 3  # of reweighting in the fit of depth
-SOLID = 0.5  # alpha
 CODE = 127  # of a component of 1 in a map of normals
 
 
@@ -191,7 +190,7 @@ def _with_axes(state: State, normals: Maps) -> Maps:
         return torch.from_numpy(state.views[view].camera.world_to_camera[:3, :3] @ turn.T).to(state.device).float()
 
     def pairs() -> Iterable[tuple[Tensor, Tensor, Tensor]]:
-        for view in spread([*normals], VIEWS):
+        for view in spread([*normals], PRIOR_VIEWS):
             photo = state.photo(view)
             rendering = state.render(photo.camera)
             guessed = at_pixels(*normals[view], photo.camera).float() / CODE
@@ -238,7 +237,7 @@ def _with_kind(state: State, depth: Maps) -> tuple[Maps, bool]:
     if not depth:
         return {}, False
     found = []
-    for view in spread([*depth], VIEWS):
+    for view in spread([*depth], PRIOR_VIEWS):
         photo = state.photo(view)
         rendering = state.render(photo.camera)
         guessed = at_pixels(*depth[view], photo.camera)

@@ -15,12 +15,13 @@ from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render.extract import extract
 from refgs.render.relight import received
+from refgs.render.rendering import SOLID
 from refgs.render.volume import with_normals_last
 from refgs.train.part import Fact, Part
 from refgs.train.state import State, why_not_traced
 from refgs.train.timeline import Step
 
-VIEWS = 24  # at least, that the mesh is fused from; all where there are fewer
+MESH_VIEWS = 24  # at least, that the mesh is fused from; all where there are fewer
 
 
 class TracedMesh(Part):
@@ -46,7 +47,7 @@ def make_mesh(state: State, step: Step) -> None:
     if why_not_traced(state):
         return
     with state.clock.part("visibility"):
-        capture, cameras = state.capture, state.spread_cameras(VIEWS)
+        capture, cameras = state.capture, state.spread_cameras(MESH_VIEWS)
         state.occluder = None
         trim()  # before the depth maps of all cameras are held
         inputs = state.inputs()
@@ -61,7 +62,7 @@ def make_mesh(state: State, step: Step) -> None:
         inputs, hidden, solid = inputs._replace(surfels=inside, occluder=state.occluder), 0.0, 1e-9
         for camera in cameras[::3]:
             seen = state.picture(inputs, camera)
-            opaque = seen.alpha > 0.5
+            opaque = seen.alpha > SOLID
             hidden += float((1 - seen.visibility)[opaque].sum())
             solid += float(opaque.sum())
         step.hidden = hidden / solid

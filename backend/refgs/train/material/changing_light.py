@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from refgs.render.relight import mirror, sphere
-from refgs.train.material.changes import LEAST_PIXELS, LEAST_VIEWS, Observations, averaged, neighbours, pooled
+from refgs.train.material.observe import LEAST_PIXELS, LEAST_VIEWS, Observations, averaged, neighbours, pooled
 
 SURFELS = 3000  # that are looked at, at the most
 LEAST_SURFELS = 400  # fewer tell nothing

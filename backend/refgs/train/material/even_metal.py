@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from refgs.model.surfels import Surfels
-from refgs.train.material.changes import SATURATED, from_grey, neighbours, pooled
+from refgs.train.material.changes import SATURATED
 from refgs.train.material.metals import Metals
+from refgs.train.material.observe import from_grey, neighbours, pooled
 from refgs.train.state import State
 from refgs.train.timeline import Step
 

@@ -14,13 +14,14 @@ import torch
 from refgs.formats.hints import KINDS
 from refgs.model.surfels import raw_metallic
 from refgs.train.material import mirrored, same_material
-from refgs.train.material.changes import falls_as_metal, observe, shines_as_metal
+from refgs.train.material.changes import falls_as_metal, shines_as_metal
 from refgs.train.material.changing_light import explained
+from refgs.train.material.observe import Kinds, observe_changes
 from refgs.train.part import Fact, Part
 from refgs.train.state import State
 from refgs.train.timeline import Step, metals_decidable
 
-METAL, PAINT = 0.9, 0.02  # metallic; training can still change it
+GIVEN = Kinds(metal=0.9, paint=0.02)  # metallic; training can still change it
 CERTAIN = 0.85  # part of the surface that shines as coloured metals do, above which all is metal; a gold cape has 0.95, matte clay 0.71
 MOSTLY = 0.6  # part of what is coloured that shines, above which what is dark may be metal, too; a bronze head has 0.69, a car 0.14
 TELLING = (
@@ -28,7 +29,7 @@ TELLING = (
 )
 TOLD = 0.005  # part of the surface, above which a change is announced
 DOUBTFUL = 0.5  # doubt from which on photos do not tell
-HELD = {"metal": 0.98, "paint": 0.002}  # metallic that is held, of each of `formats.hints.KINDS`
+HELD = Kinds(metal=0.98, paint=0.002)  # metallic that stays
 
 
 class Metals(Part):
@@ -67,7 +68,7 @@ def find_metals(state: State, step: Step) -> None:
     """
     if state.part(Metals).found:
         return
-    observations, metallic = observe(state), state.learned["metallic"]
+    observations, metallic = observe_changes(state), state.learned["metallic"]
     positions, weight = state.learned["position"].detach(), observations.pixels.sum(dim=1) * state.wanted()
     coloured, faint, tells = shines_as_metal(observations, positions)
     metal = coloured | falls_as_metal(observations, positions, float(state.environment().radiance.detach().mean()))
@@ -83,13 +84,13 @@ def find_metals(state: State, step: Step) -> None:
     if telling > TELLING * whole and shining > MOSTLY * telling:
         state.change("loss.dark", 0.0, "photos", f"{shining / telling:.0%} of what is coloured shines as metals do")
     with torch.no_grad():
-        metallic[refuted] = metallic[refuted].clamp(max=raw_metallic(PAINT))
+        metallic[refuted] = metallic[refuted].clamp(max=raw_metallic(GIVEN.paint))
         if shining > CERTAIN * whole or (faintly > CERTAIN * whole and shown_faintly.by_mirroring):
             metal = torch.ones_like(metal)
-            metallic.fill_(raw_metallic(HELD["metal"]))
+            metallic.fill_(raw_metallic(HELD.metal))
             state.learned["held"][:] = True
         else:
-            metallic[metal] = metallic[metal].clamp(min=raw_metallic(METAL))
+            metallic[metal] = metallic[metal].clamp(min=raw_metallic(GIVEN.metal))
     state.learned.forget("metallic", metal | refuted)
     state.part(Metals).found = True
     part = float(weight[metal].sum()) / max(whole, 1e-6)
@@ -106,14 +107,14 @@ def judge(state: State, step: Step) -> None:
     """
     if not state.part(Metals).found:
         return
-    surfels, seen, fit = mirrored.observe(state)
+    surfels, seen, fit = mirrored.fit_both(state)
     found = same_material.decide(surfels, seen, fit)
     names = "metallic", "albedo", "roughness"
     metallic, albedo, roughness = (state.learned[name] for name in names)
     free = ~state.learned["held"]
     raised, lowered = (which.to(metallic.device) & free for which in (found.metal, found.paint))
     like = torch.logit(found.like_metals.clamp(0.02, 0.98)).to(metallic.device)
-    metallic[raised], metallic[lowered] = raw_metallic(METAL), raw_metallic(PAINT)
+    metallic[raised], metallic[lowered] = raw_metallic(GIVEN.metal), raw_metallic(GIVEN.paint)
     albedo[raised], roughness[raised] = like[raised, :3], like[raised, 3]
     for name in names:
         state.learned.forget(name, raised | lowered)
@@ -134,7 +135,7 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
     """
     if not state.from_hull or not metals_decidable(state, state.iteration):
         return None
-    surfels, seen, fit = mirrored.observe(state)
+    surfels, seen, fit = mirrored.fit_both(state)
     found = same_material.doubt(surfels, seen, fit)
     if "held" in state.learned:
         found[state.learned["held"].cpu() & (seen.pixels > same_material.FRINGE)] = 0
@@ -151,7 +152,7 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
 def hold_as(state: State, kinds: torch.Tensor) -> None:
     """Hold the metallic of surfels from now on (see `hold`). `kinds` (N,) has their index in `hints.KINDS`, −1 for those that learn."""
     for number, kind in enumerate(KINDS):
-        state.learned["metallic"][kinds == number] = raw_metallic(HELD[kind])
+        state.learned["metallic"][kinds == number] = raw_metallic(getattr(HELD, kind))
     state.learned["held"].copy_(kinds >= 0)
     state.learned.forget("metallic", kinds >= 0)
     state.part(Metals).found = True

@@ -18,39 +18,13 @@ from refgs.model.surfels import Surfels
 from refgs.render import reference
 from refgs.render.relight import blend, mirror
 from refgs.train import probe
-from refgs.train.learn.exposures import exposure
-from refgs.train.material.changes import LEAST_CLIPPED, LEAST_PIXELS, NEIGHBOURS, VIEWS, linear, neighbours, pooled
-from refgs.train.state import RenderInputs, State
+from refgs.train.material.observe import GRAZING, NEIGHBOURS, OBSERVED_VIEWS, Seen, neighbours, observe_mirrored, pooled
+from refgs.train.state import State
 
 ROUGHNESSES = 0.05, 0.2, 0.45  # that are tried
-GRAZING = 0.15  # least cosine between normal and camera: nearer to grazing, normals are not good enough
 TOLERANCE = 0.15  # of the radiance: smaller errors of either kind tell nothing
-SEEN = 30.0  # pixels of the neighbours in all photos, at least
+ENOUGH_PIXELS = 30.0  # pixels of the neighbours in all photos, at least
 BRIGHTEST = 20.0  # radiance of a mirrored lamp, at the most: photos clip it
-
-
-class Seen(NamedTuple):
-    """Hold what V photos show of each of N surfels, on the CPU.
-
-    - `radiance` (N, V, 3): linear, without the photo's exposure
-    - `weight` (N, V): the surfel's blending weights, summed over its pixels; 0 where the surfel is clipped, hardly seen or grazing
-    - `pixels` (N,): the blending weights in all photos, wherever it is seen
-    - `mean` (N, 3): the mean radiance, of all pixels
-    - `normal` (N, V, 3): the unit normal that is blended at its pixels
-    - `towards` (N, V, 3): the unit direction to the camera
-    """
-
-    radiance: Tensor
-    weight: Tensor
-    pixels: Tensor
-    mean: Tensor
-    normal: Tensor
-    towards: Tensor
-
-    @property
-    def outward(self) -> Tensor:
-        """Return one unit normal (N, 3) of each surfel, towards the cameras that see it."""
-        return torch.nn.functional.normalize((self.normal * self.weight[..., None]).sum(dim=1), dim=1)
 
 
 class Fit(NamedTuple):
@@ -70,46 +44,19 @@ class Fit(NamedTuple):
 
 
 @torch.no_grad()
-def observe(state: State) -> tuple[Surfels, Seen, Fit]:
+def fit_both(state: State) -> tuple[Surfels, Seen, Fit]:
     """Look at the surfels in some training photos, and fit both materials to them. Also returns the surfels, on the CPU.
 
     The state must have a light. What surfels mirror of the object is known only if the state has a mesh (`occluder`).
     """
-    photos = probe.spread_views(state, VIEWS)
+    photos = probe.spread_views(state, OBSERVED_VIEWS)
     inputs = state.inputs()
     inputs = inputs._replace(surfels=Surfels(*(value.detach() for value in inputs.surfels)))
-    seen = _look(state, inputs, photos)
+    seen = observe_mirrored(state, inputs, photos)
     surfels = Surfels(*(value.cpu() for value in inputs.surfels))
     turns = [torch.from_numpy(inputs.environment.turn(state.photo(view).camera)).float() for view in photos]
     light = Environment(inputs.environment.radiance.cpu())
     return surfels, seen, _fit(seen, _mirrored(state, surfels, seen, light, turns), surfels.positions)
-
-
-def _look(state: State, inputs: RenderInputs, views: list[int]) -> Seen:
-    positions, towards, sums = inputs.surfels.positions, [], []
-    for view in views:
-        camera = torch.from_numpy(state.photo(view).camera.position).to(positions)
-        towards.append(torch.nn.functional.normalize(camera - positions, dim=1))
-        sums.append(_sums(state, inputs, view))
-    radiance, pixels, clipped, normal = torch.stack(sums, dim=1).cpu().split([3, 1, 1, 3], dim=2)
-    towards = torch.stack(towards, dim=1).cpu()
-    pixels, clipped = pixels[..., 0], clipped[..., 0]
-    mean = radiance.sum(dim=1) / pixels.sum(dim=1, keepdim=True).clamp_min(1e-6)
-    some, normal = pixels.clamp_min(1e-6), torch.nn.functional.normalize(normal, dim=2)
-    known = (pixels > LEAST_PIXELS) & (clipped < LEAST_CLIPPED * some) & ((normal * towards).sum(dim=2) > GRAZING)
-    return Seen(radiance / some[..., None], pixels * known, pixels.sum(dim=1), mean, normal, towards)
-
-
-def _sums(state: State, inputs: RenderInputs, view: int) -> Tensor:
-    """Sum over each surfel's pixels in a photo (N, 8): linear radiance, weights, those of clipped pixels, and blended normals."""
-    photo, factor = state.photo(view), exposure(state, view)
-    radiance = linear(photo)
-    radiance = radiance if factor is None else radiance / factor
-    one = torch.ones_like(radiance[..., :1])
-    clipped = photo.clipped.any(dim=-1, keepdim=True).float()
-    shown = torch.cat([radiance, one, clipped, probe.picture(state, view, inputs).normal], dim=-1)
-    features = torch.ones_like(inputs.surfels.positions[:, :1]).expand(-1, 8)
-    return probe.pixel_sums(inputs.surfels, photo, state.near, features, lambda _: shown)
 
 
 def _mirrored(
@@ -189,4 +136,4 @@ def _fit(seen: Seen, mirrored: Iterable[list[Tensor]], positions: Tensor) -> Fit
     weighed = pooled(torch.cat([chosen, total], dim=1), near)
     mean = weighed[:, :3] / weighed[:, 3:].clamp_min(1e-6)
     roughness = torch.tensor(ROUGHNESSES)[best]
-    return Fit(ratio.float(), slope.float(), mean.float(), roughness, weighed[:, 3] > SEEN)
+    return Fit(ratio.float(), slope.float(), mean.float(), roughness, weighed[:, 3] > ENOUGH_PIXELS)

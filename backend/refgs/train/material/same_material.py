@@ -13,17 +13,17 @@ from scipy.sparse.linalg import cg
 from torch import Tensor
 
 from refgs.model.surfels import Surfels
-from refgs.train.material.changes import neighbours
-from refgs.train.material.mirrored import Fit, Seen
+from refgs.train.material.mirrored import Fit
+from refgs.train.material.observe import Kinds, Seen, neighbours
 
-# Of a surfel's error as a metal, in parts of its error as paint: it is a metal below METAL, if what it mirrors shows by SLOPE and if it
-# reflects REFLECTANCE, and paint above PAINT. Painted plastic reaches a reflectance of 0.3, most metals have more than 0.4.
-METAL, PAINT = 0.6, 2.5
+# Of a surfel's error as a metal, in parts of its error as paint: it is a metal below RATIO.metal, if what it mirrors shows by SLOPE and if
+# it reflects REFLECTANCE, and paint above RATIO.paint. Painted plastic reaches a reflectance of 0.3, most metals have more than 0.4.
+RATIO = Kinds(metal=0.6, paint=2.5)
 SLOPE, REFLECTANCE = 0.12, 0.35
 SURE = 1.5  # logarithm of that ratio, above which evidence does not count more
 # Weight of what tells paint, where it is to keep paint: a metal whose shape is wrong looks like paint.
 AGAINST_METAL = 0.5
-KEPT_PAINT, KEPT_METAL = 0.045, 0.15  # weight of the kind so far
+SO_FAR = Kinds(metal=0.15, paint=0.045)  # weight of the kind so far
 # How likely a metal is, above which paint becomes metal, and below which metal becomes paint.
 LIKELY, UNLIKELY = 0.5, 0.2
 OPEN = 0.02 * SURE  # weight with which `doubt` takes a surfel for neither
@@ -31,12 +31,12 @@ FITTED = 0.01  # weight of a metal that was only fitted, beside one that was lea
 # How far evidence spreads: the weight of differences between neighbours. It grows with the number of surfels, so that evidence spreads as
 # far over a surface however densely surfels lie on it, and is at least what few surfels need.
 REACH, LEAST_REACH = 3.75e-4, 3.0
-NEIGHBOURS = 16
+LINKED = 16
 BENT, CREASED = 0.35, 0.12  # radians between neighbours' normals that convex and concave surfaces have at the most
 STEP = 0.5  # sine by which a neighbour may lie off the surfel's plane
 SHADE = 1.0  # logarithm by which the neighbours' mean radiance may differ
 FRINGE = 1.0  # pixels in all photos, below which a surfel takes no part
-TOLERANCE, STEPS = 1e-3, 200  # of conjugate gradients
+CG_TOLERANCE, CG_STEPS = 1e-3, 200  # of conjugate gradients
 
 
 class Found(NamedTuple):
@@ -58,8 +58,8 @@ def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
     """
     graph, part, metal, paint = _evidence(surfels, seen, fit)
     was, none = (surfels.metallic > 0.5).numpy(), 1e-4
-    likely = _solve(graph, metal + AGAINST_METAL * paint + KEPT_PAINT * part + none, metal)
-    kept = KEPT_METAL * was * part
+    likely = _solve(graph, metal + AGAINST_METAL * paint + SO_FAR.paint * part + none, metal)
+    kept = SO_FAR.metal * was * part
     unlikely = _solve(graph, metal + paint + kept + none, metal + kept)
     sure = np.clip(metal, 0, 1) * (likely > LIKELY) * np.where(was, 1, FITTED)
     learned, fitted = (
@@ -92,8 +92,8 @@ def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix
     graph, part = _laplacian(surfels.positions, seen), (seen.pixels > FRINGE).double().numpy()
     ratio = fit.ratio.clamp(1e-3, 1e3).log().double().numpy() * fit.seen.numpy()
     mirrors = (fit.slope > SLOPE) & (fit.reflectance.amax(dim=1) > REFLECTANCE)
-    metal = np.where(mirrors.numpy() & (ratio < np.log(METAL)), np.clip(-ratio, 0, SURE), 0) * part
-    return graph, part, metal, np.clip(ratio - np.log(PAINT), 0, SURE) * part
+    metal = np.where(mirrors.numpy() & (ratio < np.log(RATIO.metal)), np.clip(-ratio, 0, SURE), 0) * part
+    return graph, part, metal, np.clip(ratio - np.log(RATIO.paint), 0, SURE) * part
 
 
 def _solve(graph: sparse.csr_matrix, weight: np.ndarray, weighted: np.ndarray) -> np.ndarray:
@@ -103,12 +103,12 @@ def _solve(graph: sparse.csr_matrix, weight: np.ndarray, weighted: np.ndarray) -
     N. So the reach grows with N.
     """
     reach = max(REACH * len(weight), LEAST_REACH)
-    return cg(reach * graph + sparse.diags(weight), weighted, rtol=TOLERANCE, maxiter=STEPS)[0]
+    return cg(reach * graph + sparse.diags(weight), weighted, rtol=CG_TOLERANCE, maxiter=CG_STEPS)[0]
 
 
 def _laplacian(positions: Tensor, seen: Seen) -> sparse.csr_matrix:
     """Return the Laplacian (N, N) of the graph of neighbouring surfels."""
-    points, near = positions.double().numpy(), neighbours(positions, NEIGHBOURS + 1)[:, 1:].numpy()
+    points, near = positions.double().numpy(), neighbours(positions, LINKED + 1)[:, 1:].numpy()
     count = len(points)
     one, other = np.repeat(np.arange(count), near.shape[1]), near.ravel()
     normal = seen.outward.double().numpy()

@@ -1,0 +1,236 @@
+"""Look at what the photos show of each surfel: how its radiance changes from photo to photo, and the normals that are blended there."""
+
+from typing import NamedTuple
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from refgs.color import srgb_decode
+from refgs.model import harmonics
+from refgs.model.environment import turn_between
+from refgs.model.surfels import Surfels
+from refgs.train import probe
+from refgs.train.learn.exposures import exposure
+from refgs.train.photo import Photo
+from refgs.train.state import RenderInputs, State
+
+OBSERVED_VIEWS = 24  # photos that are looked at, at the most
+SWEEPS = 2  # steps in which surfels' radiance is fitted to the photos
+OVERSHOOT = 1.5  # of the later steps: surfels share pixels, so that plain steps are too short
+FACING = 0.4  # least cosine between a surfel's normal and the camera; nearer to grazing even matte surfaces change, by Fresnel
+LEAST_PIXELS = 0.5  # of a surfel in a photo; a smaller part of it tells more of its neighbours
+LEAST_VIEWS = 6  # of a surfel
+LEAST_CLIPPED = 0.05  # of a surfel's pixels in a photo; then its highlights look whiter than they are
+DARK = 0.03  # linear radiance below which a surfel does not count for a photo's exposure
+NEIGHBOURS = 64  # surfels whose changes are pooled, as one alone has too few photos
+GRAZING = 0.15  # least cosine between normal and camera: nearer to grazing, normals are not good enough
+
+
+class Kinds(NamedTuple):
+    """Hold a number for each of the two kinds of surfaces."""
+
+    metal: float
+    paint: float
+
+
+class Observations(NamedTuple):
+    """Hold what some photos show of each of N surfels.
+
+    - `mean` (N, 3): linear radiance, the same in all V photos, that explains them best.
+    - `change` (N, V, 3): how far the radiance in a photo is from `mean`.
+    - `pixels` (N, V): the surfel's blending weights in a photo, summed over its pixels; 0 where it is not usable.
+    - `clipped` (N, V): the part of `pixels` where the photo is clipped, so that its colour is not known.
+    - `normal` (N, V, 3): the surfel's normal towards the camera, in the frame in which the light stands still.
+    - `towards` (N, V, 3): the direction from the surfel to the camera, in that frame.
+    """
+
+    mean: Tensor
+    change: Tensor
+    pixels: Tensor
+    clipped: Tensor
+    normal: Tensor
+    towards: Tensor
+
+    @property
+    def usable(self) -> Tensor:
+        """Tell which photos of which surfels count (N, V): none of a surfel that too few photos show."""
+        shown = self.pixels > LEAST_PIXELS
+        return shown & (shown.sum(dim=1, keepdim=True) >= LEAST_VIEWS)
+
+
+class Seen(NamedTuple):
+    """Hold what V photos show of each of N surfels, on the CPU.
+
+    - `radiance` (N, V, 3): linear, without the photo's exposure
+    - `weight` (N, V): the surfel's blending weights, summed over its pixels; 0 where the surfel is clipped, hardly seen or grazing
+    - `pixels` (N,): the blending weights in all photos, wherever it is seen
+    - `mean` (N, 3): the mean radiance, of all pixels
+    - `normal` (N, V, 3): the unit normal that is blended at its pixels
+    - `towards` (N, V, 3): the unit direction to the camera
+    """
+
+    radiance: Tensor
+    weight: Tensor
+    pixels: Tensor
+    mean: Tensor
+    normal: Tensor
+    towards: Tensor
+
+    @property
+    def outward(self) -> Tensor:
+        """Return one unit normal (N, 3) of each surfel, towards the cameras that see it."""
+        return torch.nn.functional.normalize((self.normal * self.weight[..., None]).sum(dim=1), dim=1)
+
+
+@torch.no_grad()
+def observe_changes(state: State) -> Observations:
+    """Compare some training photos with a model in which each surfel looks the same from everywhere.
+
+    The model's radiance is fitted to the photos, with an exposure for each photo. If the light turns with the camera, the diffuse light on
+    a matte surface changes from photo to photo, too: then the model also has spherical harmonics of degree 2 of the normal in the camera's
+    frame, as irradiance has (Ramamoorthi and Hanrahan 2001). What occludes a surfel, and what it shares pixels with, is part of the model.
+    """
+    surfels = Surfels(*(value.detach() for value in state.surfels()))
+    photos = [state.photo(view) for view in probe.spread_views(state, OBSERVED_VIEWS)]
+    normals, towards = surfels.normals(), _towards(surfels, photos)
+    cosines = (towards * normals[:, None]).sum(dim=2)
+    facing = cosines.sign()[..., None] * normals[:, None]
+    light = None
+    if state.settings.light.frame == "camera":
+        turns = [torch.from_numpy(turn_between(photo.camera, state.views[0].camera)).to(normals) for photo in photos]
+        facing, towards = (torch.einsum("vij,nvj->nvi", torch.stack(turns), each) for each in (facing, towards))
+        light = harmonics.basis(facing.flatten(0, 1), 2).unflatten(0, facing.shape[:2])
+    mean = torch.zeros_like(normals)
+    factor = torch.ones_like(cosines)  # of the mean in a photo: its exposure and its diffuse light
+    for sweep in range(SWEEPS):
+        totals, pixels, _ = _residuals(surfels, photos, mean, factor, state.near)
+        step = (totals.sum(dim=1) / pixels.sum(dim=1).clamp_min(1e-6)[:, None]) * (OVERSHOOT if sweep else 1.0)
+        mean = (mean + step).clamp_min(0)
+        if sweep:
+            factor = _fitted(factor, totals, pixels, mean, light)
+    totals, pixels, burnt = _residuals(surfels, photos, mean, factor, state.near)
+    usable = pixels * (cosines.abs() > FACING)
+    some = pixels.clamp_min(1e-6)
+    return Observations(mean, totals / some[..., None], usable, burnt / some, facing, towards)
+
+
+@torch.no_grad()
+def observe_mirrored(state: State, inputs: RenderInputs, views: list[int]) -> Seen:
+    """Look at the surfels of `inputs` in some training views, without the photos' exposures, and at the normals blended there."""
+    sums = [_sums(state, inputs, view) for view in views]
+    radiance, pixels, clipped, normal = torch.stack(sums, dim=1).cpu().split([3, 1, 1, 3], dim=2)
+    towards = _towards(inputs.surfels, [state.photo(view) for view in views]).cpu()
+    pixels, clipped = pixels[..., 0], clipped[..., 0]
+    mean = radiance.sum(dim=1) / pixels.sum(dim=1, keepdim=True).clamp_min(1e-6)
+    some, normal = pixels.clamp_min(1e-6), torch.nn.functional.normalize(normal, dim=2)
+    known = (pixels > LEAST_PIXELS) & (clipped < LEAST_CLIPPED * some) & ((normal * towards).sum(dim=2) > GRAZING)
+    return Seen(radiance / some[..., None], pixels * known, pixels.sum(dim=1), mean, normal, towards)
+
+
+def _sums(state: State, inputs: RenderInputs, view: int) -> Tensor:
+    """Sum over each surfel's pixels in a photo (N, 8): linear radiance, weights, those of clipped pixels, and blended normals."""
+    photo, factor = state.photo(view), exposure(state, view)
+    radiance = _linear(photo)
+    radiance = radiance if factor is None else radiance / factor
+    one = torch.ones_like(radiance[..., :1])
+    shown = torch.cat([radiance, one, _clipped(photo), probe.picture(state, view, inputs).normal], dim=-1)
+    features = torch.ones_like(inputs.surfels.positions[:, :1]).expand(-1, 8)
+    return probe.pixel_sums(inputs.surfels, photo, state.near, features, lambda _: shown)
+
+
+def _towards(surfels: Surfels, photos: list[Photo]) -> Tensor:
+    """Return the unit directions (N, V, 3) from surfels to the photos' cameras."""
+    places = torch.stack([torch.from_numpy(photo.camera.position) for photo in photos]).to(surfels.positions)
+    return torch.nn.functional.normalize(places - surfels.positions[:, None], dim=2)
+
+
+def _linear(photo: Photo) -> Tensor:
+    """Return a photo's linear radiance (H, W, 3) over black."""
+    image = srgb_decode(photo.encoded)
+    return image if photo.mask is None else image * (photo.mask.float() / 255)[..., None]
+
+
+def _clipped(photo: Photo) -> Tensor:
+    """Return 1 where any channel of a photo is clipped, else 0: (H, W, 1)."""
+    return photo.clipped.any(dim=-1, keepdim=True).float()
+
+
+def _residuals(
+    surfels: Surfels, photos: list[Photo], mean: Tensor, factor: Tensor, near: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Sum what the photos show beyond the model over each surfel's pixels, with its blending weights.
+
+    Returns the sums (N, V, 3), the sums of the weights (N, V), and those of clipped pixels (N, V).
+    """
+    sums = []
+    for number, photo in enumerate(photos):
+        # Decoded anew each time: as floats, all photos together would take five times their memory.
+        target, lost = _linear(photo), _clipped(photo)
+        features = torch.cat([mean * factor[:, number, None], torch.ones_like(mean[:, :2])], dim=1)
+
+        def residual(shown: Tensor, target: Tensor = target, lost: Tensor = lost) -> Tensor:
+            return torch.cat([target - shown[..., :3], torch.ones_like(lost), lost], dim=-1)
+
+        sums.append(probe.pixel_sums(surfels, photo, near, features, residual))
+    totals, pixels, burnt = torch.stack(sums, dim=1).split([3, 1, 1], dim=2)
+    return totals, pixels[..., 0], burnt[..., 0]
+
+
+def _fitted(factor: Tensor, totals: Tensor, pixels: Tensor, mean: Tensor, light: Tensor | None) -> Tensor:
+    """Fit the factor of each surfel in each photo (N, V) to the residuals.
+
+    `light` (N, V, 9) are harmonics of the diffuse light. Without it, a factor depends on the photo alone. A photo's factor is a median,
+    which highlights hardly move.
+    """
+    brightness = mean.mean(dim=1)
+    known = (pixels > LEAST_PIXELS) & (brightness > DARK)[:, None]
+    wrong = totals.mean(dim=2) / (pixels * factor * brightness[:, None]).clamp_min(1e-6)
+    if light is not None:
+        rows, values = light[known], wrong[known].clamp(-1, 1)
+        square = rows.T @ rows + 1e-3 * len(rows) * torch.eye(rows.shape[1], device=rows.device)
+        more = light @ torch.linalg.solve(square, rows.T @ values)
+        factor, wrong = factor * (1 + more.clamp(-0.5, 0.5)), wrong - more
+    of_photo = [wrong[which, v].median() if which.any() else wrong.new_zeros(()) for v, which in enumerate(known.T)]
+    factor = factor * (1 + torch.stack(of_photo))
+    return factor / factor.mean()
+
+
+def from_grey(colour: Tensor) -> Tensor:
+    """Return how far the chromaticities of linear colours (N, 3) are from grey's (N, 3)."""
+    return colour / colour.sum(dim=1, keepdim=True).clamp_min(1e-6) - 1 / 3
+
+
+def averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Average observations over each surfel's neighbours, as listed in `near` (N, K).
+
+    Returns the mean radiance (N, 3), the changes (N, V, 3), and which photos show them unclipped (N, V).
+    """
+    weight = observations.pixels * (observations.clipped < LEAST_CLIPPED) * (observations.pixels > LEAST_PIXELS)
+    pixels = pooled(weight, near)
+    known = pixels > LEAST_PIXELS
+    change = pooled((observations.change * weight[..., None]).flatten(1), near).view_as(observations.change)
+    change = torch.where(known[..., None], change / pixels.clamp_min(1e-6)[..., None], 0)
+    seen = observations.pixels.sum(dim=1, keepdim=True)
+    mean = (pooled(observations.mean * seen, near) / pooled(seen, near).clamp_min(1e-6)).clamp_min(1e-4)
+    return mean, change, known
+
+
+def neighbours(positions: Tensor, most: int, of: Tensor | None = None) -> Tensor:
+    """Return the indices (M, K) of each surfel's nearest surfels, itself among them: K is `most`, or N if there are fewer.
+
+    The mask `of` (N,) chooses whose are returned; all surfels' if it is None.
+    """
+    points = positions.numpy(force=True)
+    chosen = points if of is None else positions[of].numpy(force=True)
+    ranks = [*range(1, min(most, len(points)) + 1)]
+    near = cKDTree(points).query(chosen, k=ranks, workers=torch.get_num_threads())[1]
+    return torch.from_numpy(near).to(positions.device)
+
+
+def pooled(values: Tensor, near: Tensor) -> Tensor:
+    """Sum the rows of `values` (N, …) over neighbours, as listed in `near` (M, K). Returns (M, …)."""
+    total = values.new_zeros(len(near), *values.shape[1:])
+    for column in near.T:
+        total += values[column]
+    return total
