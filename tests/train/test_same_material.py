@@ -13,6 +13,7 @@ from refgs.train.keep.asset import write_asset
 from refgs.train.material import metals, mirrored, same_material
 from refgs.train.material.mirrored import Fit
 from refgs.train.material.observe import Seen
+from refgs.train.trainer import ACTIONS
 from tests.makers.lamps import show
 from tests.makers.training import do, put
 from tests.makers.training import trainer as small
@@ -229,7 +230,7 @@ def test_half_a_mirror_makes_all_of_it_metal(made):
     state.learned["albedo"].data[:] = half.logit()
     state.learned["albedo"].data[left] = -3.0
     state.learned["roughness"].data[left] = 1.0
-    do(state, "judge metals", 0.25)
+    do(state, "judge metals", 0.25, hidden=0.1)
     with torch.no_grad():
         found = activate(state.learned.constant | state.learned.by_row)
     assert float((found.metallic > 0.8)[left].float().mean()) > 0.95
@@ -242,16 +243,29 @@ def test_paint_that_was_taken_for_metal_becomes_paint(made):
     show(made, metallic=-6.0, roughness=-1.0)
     state = made.state
     put(made, metallic=raw_metallic(0.9))
-    do(state, "judge metals", 0.25)
+    do(state, "judge metals", 0.25, hidden=0.1)
     assert float((state.surfels().metallic < 0.1).float().mean()) > 0.3, "where lamps should show most clearly"
 
 
-@pytest.mark.parametrize("iteration, progress, held", [(101, 0.25, False), (100, 0.9, False), (100, 0.25, True)])
-def test_materials_are_judged_with_new_meshes_unless_held(made, iteration, progress, held):
+@pytest.mark.parametrize("hidden, progress, held", [(None, 0.25, False), (0.1, 0.9, False), (0.1, 0.25, True)])
+def test_materials_are_judged_with_new_meshes_unless_held(made, hidden, progress, held):
     """Check that nothing changes between meshes, when the residual learns, and where metals are held."""
     show(made, metallic=-6.0, roughness=-1.0)
     state = made.state
     before = raw_metallic(0.9)
     put(made, metallic=before, held=held)
-    do(state, "judge metals", progress, done=iteration)
+    do(state, "judge metals", progress, hidden=hidden)
     assert bool((state.learned["metallic"] == torch.tensor(before)).all())
+
+
+def test_where_no_mesh_is_made_materials_are_judged_by_a_clock_of_their_own(made, monkeypatch):
+    state, judged = made.state, []
+    monkeypatch.setitem(ACTIONS, "judge metals", lambda state, step: judged.append(step.done))
+    state.change("indirect.every", 30, "plan", "the test says so")
+    for done in range(1, 200):
+        do(state, "judge metals", 0.25, done=done)
+    assert judged == [], "a mesh will be made"
+    state.change("indirect.start", 1.0, "plan", "the test says so")
+    for done in range(1, 200):
+        do(state, "judge metals", 0.25, done=done)
+    assert judged == [50, 100, 150], "an eighth of 400 iterations"

@@ -42,6 +42,18 @@ def test_times_follow_the_settings(state):
     assert due(row, state, 0.3, 7) and not due(row, state, 0.3, 8)
 
 
+@pytest.mark.parametrize("key", ["densify.every", "indirect.every"])
+def test_a_setting_does_not_change_when_something_else_is_decided(ball_capture, tmp_path, key):
+    """Check that exposures are judged at the same iterations, however often surfels are divided or meshes made."""
+    state = trainer(ball_capture, tmp_path / "run", *TINY, total=100).state
+    (row,) = (row for row in AFTER if row.what == "leave out exposures that agree")
+    found = []
+    for every in (7, 13):
+        state.change(key, every, "plan", "the test says so")
+        found.append([done for done in range(101) if due(row, state, done / 100, done)])
+    assert found[0] == found[1] == [*range(30, 101, 5)]
+
+
 def test_the_iteration_is_counted_when_it_is_over(ball_capture, tmp_path, monkeypatch):
     """Check that an iteration that fails halfway is not counted, so that it is done again from its start."""
     made = trainer(ball_capture, tmp_path / "run", *TINY, total=100)

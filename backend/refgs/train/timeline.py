@@ -14,7 +14,7 @@ from refgs.render.rendering import Rendering
 from refgs.settings import DensifySettings, RateSettings
 from refgs.train.photo import Photo
 from refgs.train.start import GEOMETRY
-from refgs.train.state import State
+from refgs.train.state import State, why_not_traced
 
 RESET = 0.01  # opacity
 SEEN = 0.2  # opacity from which on surfels explain a picture: nothing is decided, and no mesh is made, of fainter ones
@@ -66,6 +66,11 @@ class Every(NamedTuple):
 
     words: str
     length: Callable[[State], int]
+
+
+def share(of: float) -> Every:
+    """Return a period of a part of the training."""
+    return Every(f"{100 * of:g}%", lambda state: max(1, int(of * state.total)))
 
 
 ONCE = Every("once", lambda state: 1)
@@ -228,6 +233,12 @@ LIT = When("there is a light", lambda state, step: state.method.lit)
 FROM_HULL = When("all photos have masks", lambda state, step: state.from_hull)
 DEFERRED = When("pixels are shaded", lambda state, step: state.method.deferred)
 NEW_MESH = When("a mesh was made", lambda state, step: step.hidden is not None)
+JUDGE = share(1 / 8)
+JUDGED = When(
+    f"a mesh was made; where none is, every {JUDGE.words}",
+    lambda state, step: step.hidden is not None
+    or (bool(why_not_traced(state)) and step.done % JUDGE.length(state) == 0),
+)
 RESTS = When(
     "for `propagation.rest` iterations after normals were propagated",
     lambda state, step: (since := since_propagation(state, step.done)) is not None
@@ -287,7 +298,7 @@ AFTER = (
         clock="deciding",
     ),
     Row("find metals", part_after_initial(0.1) & iteration(100), RESIDUAL, ONCE, only_if=METALS, clock="deciding"),
-    Row("judge metals", None, RESIDUAL, period("indirect.every"), FROM_HULL & METALS, clock="deciding"),
+    Row("judge metals", until=RESIDUAL, only_if=JUDGED & FROM_HULL & METALS, clock="deciding"),
     Row("even coloured metal out", None, part(0.6), iterations(50)),
     Row("prune and divide surfels", setting("densify.start"), None, period("densify.every"), PRUNABLE),
     Row(
@@ -301,7 +312,7 @@ AFTER = (
         every=period("densify.reset_every"),
         only_if=When("before `densify.stop`, normals are not propagated", _resets),
     ),
-    Row("leave out exposures that agree", part(0.3), None, period("densify.every"), NOT_INITIAL & OPAQUE),
+    Row("leave out exposures that agree", part(0.3), None, share(1 / 20), NOT_INITIAL & OPAQUE),
     Row("judge the poses", part(POSES_KNOWN), every=ONCE),
 )
 """Is done after Adam's step."""
