@@ -96,6 +96,8 @@ def _read_run(folder: Path) -> RunFile:
 def check_asked(asked: Asked) -> None:
     """Raise InputError if the run in the folder `asked.out` was asked for with other settings, or planned for another time."""
     known = _read_run(asked.out)
+    if asked.hints is not None:
+        return  # it has the settings of the run that it continues
     another = "choose another folder with --out, or ask for the same"
     if asked.planned:
         if known.run.preset != asked.preset_name:

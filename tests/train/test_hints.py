@@ -121,8 +121,11 @@ def test_hinted_halves_are_held_and_so_they_are_after_a_resume(plastic, ball_cap
             state.parameters, state.optimizer, gradient, state.settings.densify, 2 * len(gradient), divide=True
         )
     assert divided and count(state, METAL) + count(state, PAINT) == len(state.parameters["metallic"])
+    once = Asked(ball_capture, out, None, "cpu", run=run, hints=file)
+    assert train_job.unfinished(once) is True
     state, quality = go_on(ball_capture, out, run, None, resume=True)
     assert state.ended and quality is not None
+    assert train_job.unfinished(once) is None
     assert count(state, METAL) + count(state, PAINT) == len(state.parameters["metallic"])
 
 
