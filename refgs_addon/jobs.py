@@ -325,40 +325,51 @@ def _run_installation(command: str, home: Path, log: Path, arguments: dict[str, 
     return _add(Job(command, Path(sys.executable), commands, log, arguments=("-I", installation.__file__)))
 
 
-def train(
-    python: Path,
-    capture: Path,
-    out: Path,
-    log: Path,
-    *,
-    preset: str | None = None,
-    minutes: float | None = None,
-    settings: Mapping[str, object] | None = None,
-    mesh: bool = True,
-    resume: bool = False,
-    hinted: tuple[Path, Path] | None = None,
-) -> Job:
-    """Start a job that trains on a capture (a folder with photos) and writes the result into the run folder `out`.
+@dataclass(frozen=True)
+class Asked:
+    """Hold what a training is asked for.
 
-    The job first waits until earlier trainings have ended. With `mesh`, it also makes a mesh after the training.
-
-    `preset` is the name of a set of settings. If it is None, the settings are chosen so that the training takes `minutes`. If both are
-    None, the preset is "standard". `settings` overrides single settings: `{"train.iterations": 2000}`. `resume` continues a stopped
-    training. `hinted` names a finished run and a file of hints: its training is continued in `out`, with its own preset and settings.
-    Raises InputError if `capture` is not a folder, if `out` is being trained already, or if a new run's `out` is not empty.
+    - `capture` is a folder with photos, `out` the run folder.
+    - `preset` is the name of a set of settings. If it is None, the settings are chosen so that the training takes `minutes`. If both are
+      None, the preset is "standard".
+    - `settings` overrides single settings: `{"train.iterations": 2000}`.
+    - `resume` continues a stopped training.
+    - `hinted` names a finished run and a file of hints: its training is continued in `out`, with its own preset and settings.
     """
-    if not capture.is_dir():
-        raise InputError(f"{capture} is not a folder: choose the folder of a capture")
-    if not resume and out.exists() and any(out.iterdir()):
+
+    capture: Path
+    out: Path
+    preset: str | None = None
+    minutes: float | None = None
+    settings: Mapping[str, object] = field(default_factory=dict)
+    resume: bool = False
+    hinted: tuple[Path, Path] | None = None
+
+    def command(self) -> dict:
+        """Return the command `train` of the job protocol that asks for it."""
+        command = {"command": "train", "capture": str(self.capture), "out": str(self.out)}
+        if self.resume:
+            return command | {"minutes": self.minutes, "resume": True}
+        if self.hinted is not None:
+            run, hints = self.hinted
+            return command | {"from": str(run), "hints": str(hints)}
+        return command | {"preset": self.preset, "minutes": self.minutes, "settings": _words(self.settings)}
+
+
+def train(python: Path, asked: Asked, log: Path, mesh: bool = True) -> Job:
+    """Start a job that trains on a capture and writes the result into a run folder.
+
+    The job first waits until earlier trainings have ended. With `mesh`, it also makes a mesh after the training. Raises InputError if the
+    capture is not a folder, if the run folder is being trained already, or if that of a new run is not empty.
+    """
+    out = asked.out
+    if not asked.capture.is_dir():
+        raise InputError(f"{asked.capture} is not a folder: choose the folder of a capture")
+    if not asked.resume and out.exists() and any(out.iterdir()):
         raise InputError(f"{out} is not empty: choose another folder for the run")
     if any(job.run == out and not job.ended for job in JOBS):
         raise InputError(f"{out} is being trained already")
-    arguments = {"preset": preset, "minutes": minutes, "settings": _words(settings or {})}
-    if resume:
-        arguments = {"minutes": minutes, "resume": True}
-    elif hinted is not None:
-        arguments = {"from": str(hinted[0]), "hints": str(hinted[1])}
-    commands = [{"command": "train", "capture": str(capture), "out": str(out)} | arguments]
+    commands = [asked.command()]
     if mesh:
         commands.append({"command": "export", "run": str(out)})
     return _add(Job(out.name, python, commands, log, out))

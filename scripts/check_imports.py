@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 # The trainer's floors, the lowest first. A module may import its own floor and those below. CONTRIBUTING.md describes each floor.
 FLOORS = (
-    ("", "camera", "clock", "color", "errors", "events", "memory", "paths", "settings"),
+    ("", "asked", "camera", "clock", "color", "errors", "events", "memory", "paths", "settings"),
     ("formats",),
     ("kernels",),
     ("model",),

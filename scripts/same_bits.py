@@ -16,6 +16,7 @@ from pathlib import Path
 
 from safetensors import safe_open
 
+from refgs.asked import Asked
 from refgs.train_job import train
 
 SMALL = [
@@ -61,8 +62,8 @@ def hashes(capture: Path, preset: str, changes: list[str], out: Path) -> dict[st
             look()
             return state.iteration >= stop * state.total
 
-        given = (capture, out, None if resume else preset, "cpu", None, [] if resume else changes, resume)
-        train(*given, lambda event, facts: None, attend)
+        given = {"resume": True} if resume else {"preset": preset, "changes": tuple(changes)}
+        train(Asked(capture, out, device="cpu", **given), lambda event, facts: None, attend)
         look()
 
     train_until(0.5, resume=False)

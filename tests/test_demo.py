@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
@@ -19,8 +20,8 @@ SMALL += ["mesh.resolution=48", "mesh.triangles=1000", "mesh.texture=64"]
 def test_from_photos_to_the_report(tmp_path, monkeypatch):
     train, out = commands.train, tmp_path / "the demo"
 
-    def small(capture, run, preset, *words, resume):
-        return train(capture, run, preset, *words[:2], SMALL, resume)
+    def small(asked):
+        return train(replace(asked, changes=tuple(SMALL)))
 
     monkeypatch.setattr(commands, "train", small)
     monkeypatch.setattr(demo, "HDRIS", ("studio",))

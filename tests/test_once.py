@@ -9,6 +9,7 @@ import time
 import pytest
 
 from refgs import commands, train_job
+from refgs.asked import Asked
 from refgs.errors import InputError, TryAgain
 from refgs.lock import LOCK, RunLock
 from refgs.train.keep import checkpoint
@@ -19,7 +20,7 @@ WORDS = [*TINY, "environment.resolution=16", "train.iterations=100000", "mesh.re
 
 
 def train(capture, out, changes=WORDS, minutes=0.05):
-    commands.train(capture, out, "quick", "cpu", minutes, changes, resume=False, once=True)
+    commands.train(Asked(capture, out, "quick", "cpu", minutes, tuple(changes)), once=True)
 
 
 def contents(run) -> dict:
@@ -72,7 +73,7 @@ def test_each_step_is_done_once(ball_capture, tmp_path, capsys):
     with pytest.raises(InputError, match=r"trained with train\.iterations = 100000, and not 90000"):
         train(ball_capture, run, [*WORDS, "train.iterations=90000"])
     with pytest.raises(InputError, match=r"trained by quick, not for 1 minutes"):
-        commands.train(ball_capture, run, None, "cpu", 1, [], resume=False, once=True)
+        commands.train(Asked(ball_capture, run, None, "cpu", 1), once=True)
 
 
 def test_textures_of_a_killed_export_do_not_stop_the_next(ball_capture, tmp_path):
@@ -85,8 +86,8 @@ def test_textures_of_a_killed_export_do_not_stop_the_next(ball_capture, tmp_path
 
 def test_a_run_in_use_says_try_again(ball_capture, tmp_path):
     run = tmp_path / "run"
-    how = ball_capture, run, "quick", "cpu", None, WORDS, False, lambda event, facts: None
-    train_job.train(*how, lambda state: state.iteration == 1)
+    asked = Asked(ball_capture, run, "quick", "cpu", changes=tuple(WORDS))
+    train_job.train(asked, lambda event, facts: None, lambda state: state.iteration == 1)
     with RunLock(run), pytest.raises(TryAgain, match="is in use"):
         train(ball_capture, run)
 

@@ -13,6 +13,7 @@ from scripts import settings_page
 def test_every_preset_is_valid(name):
     settings = load_settings(name)
     assert settings.surfels.start <= settings.surfels.budget
+    assert settings.region == load_settings("standard").region  # a training for a time takes one box for two presets
 
 
 def test_set_changes_one_value():

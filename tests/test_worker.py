@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from refgs import train_job
+from refgs.asked import Asked
 from refgs.errors import InputError
 from refgs.lock import LOCK, PROGRESS, STOP, RunLock
 from tests.makers.captures import nerfstudio
@@ -361,7 +362,7 @@ def test_a_folder_that_is_trained_in(talk, ball_capture, run):
     """
     until((run / PROGRESS).exists, PATIENCE)
     assert json.loads((run / PROGRESS).read_text()).keys() == {"iteration", "total", "seconds_left"}
-    words = (ball_capture, run, "quick", "cpu", None, [], True, lambda event, facts: None, lambda trainer: True)
+    words = (Asked(ball_capture, run, "quick", "cpu", resume=True), lambda event, facts: None, lambda trainer: True)
     with pytest.raises(InputError, match="is in use: another process trains it") as refused:
         train_job.train(*words)
     assert "\n" not in str(refused.value)

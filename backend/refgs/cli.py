@@ -13,6 +13,7 @@ from typing import Annotated, NoReturn
 import typer
 
 import refgs
+from refgs.asked import Asked
 from refgs.errors import TRY_AGAIN, InputError, InputWarning, TryAgain, one_line
 from refgs.memory import shortage_named
 from refgs.paths import disk_errors_named
@@ -111,9 +112,10 @@ def train(
     ] = False,
 ) -> None:
     """Train surfels, materials and light from a capture."""
+    asked = Asked(capture, out, preset, device, minutes, tuple(changes or ()), resume, run, hints)
     from refgs import commands
 
-    commands.train(capture, out, preset, device, minutes, changes or [], resume, run, hints, once)
+    commands.train(asked, once)
 
 
 @app.command()

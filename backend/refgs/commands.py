@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from refgs import train_job
+from refgs.asked import Asked, check_device
 from refgs.errors import TRY_AGAIN, InputError, one_line
 from refgs.export.export_job import export as export_run
 from refgs.lock import remove_stale_lock
@@ -121,33 +122,21 @@ def masks(folder: Path, changes: list[str], model: Path | None = None, once: boo
     console.print(f"the object's box: {' '.join(found['region'])}")
 
 
-def train(
-    capture_folder: Path,
-    out: Path,
-    preset: str | None,
-    device: str,
-    minutes: float | None,
-    changes: list[str],
-    resume: bool,
-    run: Path | None = None,
-    hints: Path | None = None,
-    once: bool = False,
-) -> None:
-    """Train on a capture and write a run folder. With a finished `run` and a file of `hints` about it, continue its training.
+def train(asked: Asked, once: bool = False) -> None:
+    """Train on a capture and write a run folder, or resume the training in it.
 
-    Ctrl-C ends the training with a checkpoint, from which `resume` continues. A second Ctrl-C ends it at once. SIGTERM ends it with a
+    Ctrl-C ends the training with a checkpoint, from which it can be resumed. A second Ctrl-C ends it at once. SIGTERM ends it with a
     checkpoint if that takes no longer than CHECKPOINT_BY; otherwise the last one counts.
 
     With `once`, the training is started, or resumed, or left as it is if it has ended. It must be asked for as it was before.
     """
-    hinted = train_job.hinted(run, hints, resume)
     if once:
-        left = train_job.unfinished(out, preset, minutes, changes)
+        left = train_job.unfinished(asked)
         if left is None:
-            console.print(f"done before: {out}")
+            console.print(f"done before: {asked.out}")
             return
         if left:
-            resume, changes, hinted = True, [], None
+            asked = asked.resumed()
     with progress_bar("training", 1) as bar, _signals_to_stop() as stopped:
 
         def report(event: str, facts: dict) -> None:
@@ -161,15 +150,13 @@ def train(
             elif event != "measured":
                 print_event(event, facts)
 
-        trainer, quality = train_job.train(
-            capture_folder, out, preset, device, minutes, changes, resume, report, lambda _: bool(stopped), hinted
-        )
-    if not trainer.ended:
-        again = command_line("refgs", "train", capture_folder, "--out", out, "--resume")
-        console.print(f"stopped at iteration {trainer.iteration}; resume with: {again}")
+        state, quality = train_job.train(asked, report, lambda _: bool(stopped))
+    if not state.ended:
+        again = command_line("refgs", "train", asked.capture, "--out", asked.out, "--resume")
+        console.print(f"stopped at iteration {state.iteration}; resume with: {again}")
         _end(stopped)
-    held_out = "" if quality is None else f", {quality:.2f} dB on {len(trainer.capture.test_views)} held-out views"
-    console.print(f"trained {trainer.iteration} iterations in {trainer.seconds:.0f} s{held_out}: {out}")
+    held_out = "" if quality is None else f", {quality:.2f} dB on {len(state.capture.test_views)} held-out views"
+    console.print(f"trained {state.iteration} iterations in {state.seconds:.0f} s{held_out}: {asked.out}")
 
 
 @contextmanager
@@ -357,7 +344,7 @@ def batch(
     from refgs.batch.listing import Ask
     from refgs.batch.page import PAGE
 
-    train_job.check_device(device)
+    check_device(device)
     ask = Ask(preset=preset, minutes=minutes, set=changes)
     with (
         _batch_bars() as report,

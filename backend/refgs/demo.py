@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 from refgs import commands, train_job
+from refgs.asked import Asked
 from refgs.compare import metrics
 from refgs.compare.truth import read_relit
 from refgs.errors import InputError
@@ -45,7 +46,7 @@ def run(out: Path) -> None:
         _child(root, "rendering", "scripts.demo", SCENE, "--out", capture, "--relight", *HDRIS)
     if not (folder / "splats.ply").exists():
         stage("training surfels, materials and light")
-        commands.train(capture, folder, "quick", "auto", None, [], resume=(folder / "run.toml").exists())
+        commands.train(Asked(capture, folder, "quick", resume=(folder / "run.toml").exists()))
     if not (folder / "mesh.glb").exists():
         stage("fusing and baking the mesh")
         commands.export(folder)

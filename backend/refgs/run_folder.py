@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from refgs import __version__
+from refgs.asked import Asked
 from refgs.errors import InputError
 from refgs.formats.metrics import read_metrics
 from refgs.formats.run_toml import Made, RunFile, Trained
 from refgs.formats.validate import read_tables, validated
 from refgs.lock import LOCK, PROGRESS, STOP
 from refgs.paths import check_unicode, command_line, is_leftover, write_text
-from refgs.settings import Settings, load_settings, recorded_settings
+from refgs.settings import Settings, recorded_settings
 
 PHOTOS = "photos"  # a folder of reduced photos, while they are trained on
 CHECKPOINTS = "checkpoints"
@@ -92,24 +93,26 @@ def _read_run(folder: Path) -> RunFile:
     return validated(tables, RunFile, str(file), again)
 
 
-def check_asked(folder: Path, preset: str | None, minutes: float | None, changes: list[str]) -> None:
-    """Raise InputError if the run in a folder was asked for with other settings than these, which are those of `refgs train`."""
-    known = _read_run(folder)
+def check_asked(asked: Asked) -> None:
+    """Raise InputError if the run in the folder `asked.out` was asked for with other settings, or planned for another time."""
+    known = _read_run(asked.out)
+    if asked.hints is not None:
+        return  # it has the settings of the run that it continues
     another = "choose another folder with --out, or ask for the same"
-    if preset is None and minutes is not None:
-        if known.run.preset != (asked := f"{minutes:g} minutes"):
-            raise InputError(f"{folder} was trained by {known.run.preset}, not for {asked}: {another}")
+    if asked.planned:
+        if known.run.preset != asked.preset_name:
+            raise InputError(f"{asked.out} was trained by {known.run.preset}, not for {asked.preset_name}: {another}")
         return  # its settings were chosen
-    tables = recorded_settings(known.settings, str(folder / "run.toml")).model_dump(mode="json")
+    tables = recorded_settings(known.settings, str(asked.out / "run.toml")).model_dump(mode="json")
     for key, row in known.changed.items():
         section, name = key.split(".")
         tables[section][name] = row.asked
-    wanted = load_settings(preset or "standard", changes).model_dump(mode="json")
+    wanted = asked.settings().model_dump(mode="json")
     for section, table in wanted.items():
         for name, value in table.items():
             if value != (was := tables[section][name]):
                 what = f"{section}.{name} = {was}, and not {value}"
-                raise InputError(f"{folder} was trained with {what}: {another}")
+                raise InputError(f"{asked.out} was trained with {what}: {another}")
 
 
 def _release(version: str) -> tuple[int, ...]:

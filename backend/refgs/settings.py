@@ -3,8 +3,9 @@
 import os
 import reprlib
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
@@ -307,22 +308,41 @@ def preset_names() -> list[str]:
     return sorted(file.stem for file in PRESETS.glob("*.toml"))
 
 
-def load_settings(preset: str, changes: list[str] = ()) -> Settings:
+class Assignment(NamedTuple):
+    """Hold one change of a setting, parsed from its `text`, which is `section.key=value`."""
+
+    text: str
+    section: str
+    name: str
+    value: Any
+
+
+def load_settings(preset: str, changes: Iterable[str] = ()) -> Settings:
     """Load a preset by name or a TOML file, and apply `section.key=value` changes.
 
     A file may start from a preset with `base = "NAME"`. Raises InputError naming the wrong key and what it may be.
     """
+    return preset_settings(preset, map(parse_change, changes))
+
+
+def preset_settings(preset: str, changes: Iterable[Assignment]) -> Settings:
+    """Load a preset as `load_settings` does, and apply changes that were parsed before."""
     tables = _read_preset(preset)
     for change in changes:
-        key, equals, value = change.partition("=")
-        key = SHORT.get(key.strip(), key.strip())
-        section, dot, name = key.partition(".")
-        if not equals or not dot:
-            raise InputError(f"--set {change}: write it as section.key=value, e.g. train.iterations=2000")
-        if not isinstance(tables.setdefault(section, {}), dict):
-            raise InputError(f"--set {change}: there is no section {section}")
-        tables[section][name] = _parse(value)
+        if not isinstance(tables.setdefault(change.section, {}), dict):
+            raise InputError(f"--set {change.text}: there is no section {change.section}")
+        tables[change.section][change.name] = change.value
     return validate(tables, preset)
+
+
+def parse_change(text: str) -> Assignment:
+    """Parse a change `section.key=value`. Some keys need no section (`SHORT`). Raises InputError if it is not written so."""
+    key, equals, value = text.partition("=")
+    key = SHORT.get(key.strip(), key.strip())
+    section, dot, name = key.partition(".")
+    if not equals or not dot:
+        raise InputError(f"--set {text}: write it as section.key=value, e.g. train.iterations=2000")
+    return Assignment(text, section, name, _parse(value))
 
 
 def recorded_settings(tables: dict[str, Any], source: str) -> Settings:

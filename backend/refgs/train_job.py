@@ -3,15 +3,16 @@
 Importing torch takes seconds. So the arguments are checked before it is imported, where possible.
 """
 
-import math
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from refgs.asked import Asked
 from refgs.errors import InputError, TryAgain
 from refgs.events import Report
 from refgs.formats.run_toml import Trained
@@ -29,112 +30,76 @@ from refgs.run_folder import (
     read_run_facts,
     update_metrics,
 )
-from refgs.settings import Settings, load_settings
-from refgs.train.effective import Change
+from refgs.settings import Settings
+from refgs.train.effective import Effective
 from refgs.train.plan import Plan
 
 if TYPE_CHECKING:
-    from refgs.capture import Capture
+    from refgs.capture import Capture, CaptureFiles
     from refgs.formats.hints import Hint
     from refgs.train.state import State
     from refgs.train.trainer import Trainer
 
 
-class Hinted(NamedTuple):
-    """Name a finished `run` whose training is continued in a new folder, and the `file` of hints about its parts."""
+class _Known(NamedTuple):
+    """Hold what is known of a training before its capture is read.
 
-    run: Path
-    file: Path
+    `preset` is recorded in run.toml. `run` is the run that is resumed, or whose training is continued with `hints`, and `facts` are its
+    table [run].
+    """
+
+    settings: Settings
+    preset: str
+    run: Path | None = None
+    facts: Trained | None = None
+    hints: "Sequence[Hint]" = ()
 
 
-def train(
-    capture_folder: Path,
-    out: Path,
-    preset: str | None,
-    device: str,
-    minutes: float | None,
-    changes: list[str],
-    resume: bool,
-    report: Report,
-    attend: "Callable[[State], bool]",
-    hinted: Hinted | None = None,
-) -> "tuple[State, float | None]":
+def train(asked: Asked, report: Report, attend: "Callable[[State], bool]") -> "tuple[State, float | None]":
     """Train on a capture and write a run folder, or resume the training in it. At the end write the results and measure their quality.
 
-    - `minutes` limits the whole job; pauses do not count. Without a preset, all settings are chosen to fit into that time. Without both,
-      the preset is `standard`.
-    - `changes` are settings to change, `section.key=value`.
     - `report(event, facts)` is called for progress and warnings.
-    - `attend(state)` is called before each iteration. If it returns True, the training stops with a checkpoint; `resume` continues it.
+    - `attend(state)` is called before each iteration. If it returns True, the training stops with a checkpoint, and can be resumed.
       Another process can stop it too (`refgs.lock`).
-    - With `hinted`, most of that run's training is repeated, with its settings, while the hinted parts are held (`train/hints.py`).
+    - With hints, most of a finished run's training is repeated while the hinted parts are held (`train/hints.py`).
 
     Returns the training's state and the mean PSNR of the held-out views. `state.ended` is False if the training was stopped. The PSNR is
     None then, or if there are no held-out views.
     """
-    plan, lock = Plan(minutes), RunLock(out)
-    check_device(device)
-    if minutes is not None and not math.isfinite(minutes):
-        raise InputError(f"--minutes {minutes}: take a number of minutes, e.g. 5")
-    hints: list[Hint] = []
-    if resume:
-        facts, settings = _resumed_settings(out, changes)
-    elif hinted is not None:
-        facts, settings, hints = _hinted_settings(hinted, out, preset, changes)
-    else:
-        facts, settings = _new_settings(out, preset, changes)
+    plan, out, lock = Plan(asked.minutes), asked.out, RunLock(asked.out)
+    known = _known(asked)
     with ExitStack() as held:
         held.enter_context(_removed_if_empty(out))
-        held.enter_context(shortage_named(_less(settings)))
+        held.enter_context(shortage_named(_less(known.settings)))
         held.enter_context(lock)
-        if resume:
+        if asked.resume:
             _check_unfinished(out)
         else:
             clear(out)
-        capture = _read_capture(capture_folder, settings, hinted.run if hinted else out, facts)
-        masked: dict[str, Change] = {}
-        if facts is None and settings.image.masks == "auto" and not any(view.masked for view in capture.views):
-            capture, settings, changes, masked = _with_masks(capture, settings, preset, changes, report)
-        for what in capture.warnings:
-            report("warning", {"what": what})
-        device = choose_device(device, report)
+        capture, effective = _read_capture(asked.capture, known, report)
+        device = choose_device(asked.device, report)
         held.enter_context(_logged(out))
         with _card_memory():
-            if resume:
-                trainer = _resume(capture, settings, out, plan, device, report)
-            elif hinted is not None:
-                trainer = _start_hinted(capture, settings, facts.preset, hinted.run, hints, out, plan, device, report)
-            else:
-                trainer = _start(capture, settings, preset, changes, masked, out, plan, device, report)
-            held.enter_context(disk_errors_named([out], "resume with --resume"))
-            state = trainer.state
-            trainer.run(lambda: attend(state) or lock.attend(state.iteration, state.total, state.seconds))
+            trainer = _trainer(asked, known, capture, effective, plan, device, report)
+        held.enter_context(disk_errors_named([out], "resume with --resume"))
+        state = trainer.state
+        trainer.run(lambda: attend(state) or lock.attend(state.iteration, state.total, state.seconds))
         if not state.ended:
             return state, None  # its reduced photos stay, for it may be resumed
-        return state, _finish(trainer, out, plan, report)
+        return state, _finish(trainer)
 
 
-def hinted(run: Path | None, file: Path | None, resume: bool) -> Hinted | None:
-    """Return the run to continue and the file of hints, if both were given; None if neither. Raises InputError otherwise."""
-    if run is None and file is None:
-        return None
-    if run is None or file is None:
-        raise InputError("--from and --hints go together: a finished run, and a file that says what its parts are")
-    if resume:
-        raise InputError("--resume continues the run in --out, which knows its hints: leave out --from and --hints")
-    return Hinted(run, file)
-
-
-def unfinished(out: Path, preset: str | None, minutes: float | None, changes: list[str]) -> bool | None:
+def unfinished(asked: Asked) -> bool | None:
     """Say what is left of a training that may have been started before: for `refgs train --once`.
 
-    Returns False if it must be started, True if it must be resumed, None if it has ended. Raises InputError if `out` holds a training with
-    other settings than those asked for, and TryAgain if another process works in it.
+    Returns False if it must be started, True if it must be resumed, None if it has ended. Raises InputError if its run folder holds a
+    training with other settings than those asked for, and TryAgain if another process works in it.
     """
+    out = asked.out
     if not (out / "run.toml").exists():
         return False
-    check_asked(out, preset, minutes, changes)
-    if (out / "splats.ply").exists():
+    check_asked(asked)
+    if (out / SPLATS).exists():
         remove_stale_lock(out)
         return None
     with RunLock(out):
@@ -146,7 +111,6 @@ def choose_device(device: str, report: Report) -> str:
 
     If a GPU was asked for or found but cannot be used, report a warning and return "cpu".
     """
-    check_device(device)
     if device == "cpu":
         return "cpu"
     from refgs.kernels import cuda
@@ -166,39 +130,24 @@ def _less(settings: Settings) -> str:
     return f"close other programs and resume, or train into a new folder with {parts}"
 
 
-def check_device(device: str) -> None:
-    """Raise InputError unless `device` is one that `--device` takes."""
-    if device not in ("auto", "cpu", "cuda"):
-        raise InputError(f"--device {device}: take auto, cpu or cuda")
-
-
-def _new_settings(out: Path, preset: str | None, changes: list[str]) -> tuple[None, Settings]:
-    settings = load_settings(preset or "standard", changes)
-    check_free(out)
-    return None, settings
-
-
-def _resumed_settings(out: Path, changes: list[str]) -> tuple[Trained, Settings]:
-    facts, settings = read_run_facts(out)
-    if changes:
-        raise InputError("--set cannot change a run that is resumed: train into a new folder")
-    return facts, settings
-
-
-def _hinted_settings(
-    hinted: Hinted, out: Path, preset: str | None, changes: list[str]
-) -> "tuple[Trained, Settings, list[Hint]]":
+def _known(asked: Asked) -> _Known:
+    """Read the settings, and check what can be checked before torch is imported."""
+    if asked.resume:
+        facts, settings = read_run_facts(asked.out)
+        return _Known(settings, facts.preset, asked.out, facts)
+    if asked.run is None:
+        settings = asked.settings()
+        check_free(asked.out)
+        return _Known(settings, asked.preset_name)
     from refgs.formats.hints import read_hints
 
-    facts, settings = check_finished(hinted.run)
-    if changes or preset:
-        raise InputError("--set and --preset cannot change a run that is continued with hints: it keeps its settings")
-    if not any((hinted.run / CHECKPOINTS).glob("*.toml")):
+    facts, settings = check_finished(asked.run)
+    if not any((asked.run / CHECKPOINTS).glob("*.toml")):
         raise InputError(
-            f"{hinted.run} has no checkpoint to continue from: name the run that was trained, not an edited copy"
+            f"{asked.run} has no checkpoint to continue from: name the run that was trained, not an edited copy"
         )
-    check_free(out)
-    return facts, settings, read_hints(hinted.file)
+    check_free(asked.out)
+    return _Known(settings, facts.preset, asked.run, facts, read_hints(asked.hints))
 
 
 def _check_unfinished(out: Path) -> None:
@@ -206,112 +155,98 @@ def _check_unfinished(out: Path) -> None:
         raise InputError(f"{out}: this training has ended; there is nothing to resume")
 
 
-def _read_capture(folder: Path, settings: Settings, out: Path, facts: Trained | None) -> "Capture":
-    check_folder(folder)  # before numpy is imported
-    from refgs.capture import read_capture
+def _read_capture(folder: Path, known: _Known, report: Report) -> "tuple[Capture, Effective]":
+    """Read the capture, and make masks for a new training if the capture has none. Return it, and the settings to train with.
 
-    capture = read_capture(folder, settings.region)
-    if facts is not None:
-        capture.check_unchanged(out, facts.fingerprint)
-    return capture
+    Raises InputError if it is not the capture that the known run was trained on.
+    """
+    check_folder(folder)  # before numpy is imported
+    from refgs.capture import read_files, to_run_frame
+
+    effective, files = Effective.of(known.settings), read_files(folder)
+    capture = to_run_frame(files, known.settings.region)
+    if known.facts is not None:
+        capture.check_unchanged(known.run, known.facts.fingerprint)
+    elif known.settings.image.masks == "auto" and not any(view.masked for view in capture.views):
+        files, effective = _with_masks(files, capture, effective, report)
+        capture = to_run_frame(files, effective.settings.region)
+    for what in capture.warnings:
+        report("warning", {"what": what})
+    return capture, effective
 
 
 def _with_masks(
-    capture: "Capture", settings: Settings, preset: str | None, changes: list[str], report: Report
-) -> "tuple[Capture, Settings, list[str], dict[str, Change]]":
+    files: "CaptureFiles", capture: "Capture", effective: Effective, report: Report
+) -> "tuple[CaptureFiles, Effective]":
     """Make masks of a capture that has none, so that the object is trained alone.
 
-    Return the capture with its masks, the settings, the changes that lead to them, and records of what was changed. A box in the settings
-    is moved with the capture's frame. If no object is found, report a warning and return what was given. Raises InputError if masks cannot
-    be written: learnt with its surroundings, the object would be worth little.
+    Return the capture's files with their masks, and the settings. A box in the settings is moved with the capture's frame. If no object is
+    found, report a warning and return what was given. Raises InputError if masks cannot be written: learnt with its surroundings, the
+    object would be worth little.
     """
-    from refgs.capture import read_capture
-    from refgs.capture.masks import ReadOnlyError, make_masks, masks_folder
+    from refgs.capture.masks import ReadOnlyError, masks_folder, moved_region, with_masks
 
     try:
-        found = make_masks(capture.folder, settings.region, report)
+        files, found = with_masks(files, effective.asked.region, report)
     except ReadOnlyError as error:
         raise InputError(f"{error} Or train on all that the photos show: --set image.masks=off") from None
     except (InputError, OSError) as error:
         report("warning", {"what": f"training on all that the photos show, for no masks were made: {error}"})
-        return capture, settings, changes, {}
+        return files, effective
     where = masks_folder(capture)
     what = f"made {found['made']} masks of the object, in {where}: look at them"
-    report("masks", found | {"capture": str(capture.folder.resolve()), "what": what})
-    records = {
-        "image.masks": Change("auto", "made", "photos", f"no photo had a mask; {found['made']} are in {where} now")
-    }
-    if capture.box is not None:
-        moved, why = found["moved"], "the masks moved the capture's frame"
-        scale = sum(row[0] ** 2 for row in moved[:3]) ** 0.5
-        centre = [sum(a * b for a, b in zip(row, (*settings.region.centre, 1.0), strict=True)) for row in moved[:3]]
-        box = {"region.centre": centre, "region.size": [scale * edge for edge in settings.region.size]}
-        changes = [*changes, *(f"{key}={value}" for key, value in box.items())]
-        asked = {"region.centre": list(settings.region.centre), "region.size": list(settings.region.size)}
-        records |= {key: Change(asked[key], value, "photos", why) for key, value in box.items()}
-        settings = load_settings(preset or "standard", changes)
-        report("stage", {"what": f"{why}: the box is {' '.join(f'{k}={_rounded(v)}' for k, v in box.items())} in it"})
-    return read_capture(capture.folder, settings.region), settings, changes, records
+    report("masks", found | {"capture": str(files.folder.resolve()), "what": what})
+    why = f"no photo had a mask; {found['made']} are in {where} now"
+    effective = effective.noted("image.masks", "made", "photos", why)
+    if capture.box is None:
+        return files, effective
+    region, why = moved_region(effective.asked.region, found["moved"]), "the masks moved the capture's frame"
+    box = f"region.centre={_rounded(region.centre)} region.size={_rounded(region.size)}"
+    report("stage", {"what": f"{why}: the box is {box} in it"})
+    return files, effective.moved_to(effective.asked.model_copy(update={"region": region}), "photos", why)
 
 
-def _rounded(values: list[float]) -> list[float]:
+def _rounded(values: Iterable[float]) -> list[float]:
     return [round(value, 4) + 0.0 for value in values]
 
 
-def _start(
-    capture: "Capture",
-    settings: Settings,
-    preset: str | None,
-    changes: list[str],
-    masked: dict[str, Change],
-    out: Path,
-    plan: Plan,
-    device: str,
-    report: Report,
+def _trainer(
+    asked: Asked, known: _Known, capture: "Capture", effective: Effective, plan: Plan, device: str, report: Report
 ) -> "Trainer":
-    """Make the trainer of a new training, create its run folder, and return the trainer.
-
-    `masked` are changes that are recorded with those of the training: what the making of masks changed.
-    """
+    """Make the trainer. Load the last checkpoint of a run that is resumed; create the run folder of any other."""
     from refgs.train.fit import fitting
-    from refgs.train.trainer import Trainer
-
-    with _no_photos_left(out):
-        if preset is None and plan.minutes is not None:
-            trainer, preset = fitting(capture, changes, out, plan, device, report), f"{plan.minutes:g} minutes"
-        else:
-            trainer = Trainer(capture, settings, out, report, plan, device)
-    state = trainer.state
-    state.effective = replace(state.effective, changes=masked | state.effective.changes)
-    _create_run(state, preset or "standard", device)
-    return trainer
-
-
-def _start_hinted(
-    capture: "Capture",
-    settings: Settings,
-    preset: str,
-    run: Path,
-    hints: "list[Hint]",
-    out: Path,
-    plan: Plan,
-    device: str,
-    report: Report,
-) -> "Trainer":
-    """Make the trainer that continues a finished run with hints, create its run folder with a first checkpoint, and return the trainer."""
-    from refgs.formats.hints import FILE, write_hints
     from refgs.train.hints import continue_with_hints
     from refgs.train.trainer import Trainer
 
-    with _no_photos_left(out):
-        trainer = Trainer(capture, settings, out, report, plan, device)
-        continue_with_hints(trainer.state, run, hints)
+    make = partial(Trainer, capture, effective, asked.out, report, plan, device)
+    if asked.resume:
+        return _resumed(make())
+    with _no_photos_left(asked.out):
+        if asked.planned:
+            quick = asked.settings("quick")
+            # Masks may have moved the box; all presets have the same.
+            moved = quick.model_copy(update={"region": effective.settings.region})
+            rehearsed = replace(effective, asked=quick, settings=moved)
+            trainer = fitting(capture, rehearsed, effective.settings, asked.out, plan, device, report)
+        else:
+            trainer = make()
+        if known.hints:
+            continue_with_hints(trainer.state, known.run, known.hints)
+    if known.hints:
+        _save_with_hints(trainer, known)
+    _create_run(trainer.state, known.preset, device)
+    return trainer
+
+
+def _save_with_hints(trainer: "Trainer", known: _Known) -> None:
+    """Save a first checkpoint and the hints. A run with hints always has a checkpoint, for it cannot start over without them."""
+    from refgs.formats.hints import FILE, write_hints
+
+    out = trainer.state.folder
     with disk_errors_named([out], "train again"):
         out.mkdir(parents=True, exist_ok=True)
-        trainer.save()  # before run.toml, so that a run with hints always has a checkpoint: it cannot start over without them
-        write_hints(out / FILE, run, hints)
-    _create_run(trainer.state, preset, device)
-    return trainer
+        trainer.save()
+        write_hints(out / FILE, known.run, known.hints)
 
 
 @contextmanager
@@ -346,23 +281,24 @@ def _create_run(state: "State", preset: str, device: str) -> None:
         create_run(state.folder, state.capture, *facts)
 
 
-def _resume(capture: "Capture", settings: Settings, out: Path, plan: Plan, device: str, report: Report) -> "Trainer":
-    """Return the trainer of an interrupted training, with its last checkpoint loaded, or ready to start over if there is none."""
+def _resumed(trainer: "Trainer") -> "Trainer":
+    """Load the last checkpoint of an interrupted training. Without one, the trainer stays ready to start over. Return the trainer."""
     from refgs.formats.hints import FILE
-    from refgs.train.trainer import Trainer
 
-    trainer = Trainer(capture, settings, out, report, plan, device)
     trainer.resume()
-    what = f"resumed at iteration {trainer.state.iteration}"
-    if trainer.state.iteration == 0:
-        if (out / FILE).exists():
-            raise InputError(f"{out} has no checkpoint left: train again with --from and --hints, into a new folder")
+    state = trainer.state
+    what = f"resumed at iteration {state.iteration}"
+    if state.iteration == 0:
+        if (state.folder / FILE).exists():
+            raise InputError(
+                f"{state.folder} has no checkpoint left: train again with --from and --hints, into a new folder"
+            )
         what = "there is no checkpoint to resume from: starting over"
-    report("stage", {"what": what})
+    state.report("stage", {"what": what})
     return trainer
 
 
-def _finish(trainer: "Trainer", out: Path, plan: Plan, report: Report) -> float | None:
+def _finish(trainer: "Trainer") -> float | None:
     """Write the results and metrics.json. Return the mean PSNR of the held-out views, None without such views.
 
     All comes before splats.ply, by which a run has ended. So a training that is killed here is resumed, and does it again.
@@ -372,7 +308,7 @@ def _finish(trainer: "Trainer", out: Path, plan: Plan, report: Report) -> float 
     from refgs.train.keep.asset import write_asset
     from refgs.train.keep.measures import held_out_psnr
 
-    state, quality = trainer.state, None
+    state, out, quality = trainer.state, trainer.state.folder, None
     again = command_line("refgs", "train", state.capture.folder, "--out", out, "--resume", "--device", "cpu")
 
     def measure() -> None:
@@ -382,10 +318,10 @@ def _finish(trainer: "Trainer", out: Path, plan: Plan, report: Report) -> float 
         quality = held_out_psnr(state, most=len(state.test))
         trim()
         trades = ambiguities(state)
-        update_metrics(out, _most_memory() | {"ambiguities": trades, "total_seconds": plan.spent})
+        update_metrics(out, _most_memory() | {"ambiguities": trades, "total_seconds": state.plan.spent})
         for facts in trades.values():
             if "what" in facts:
-                report("stage", {"what": facts["what"]})
+                state.report("stage", {"what": facts["what"]})
         if (out / PHOTOS).exists():
             trainer.release_photos()
             _remove_photos(out)

@@ -17,6 +17,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from refgs import __version__, train_job
+from refgs.asked import Asked, check_device
 from refgs.capture import read_capture
 from refgs.capture.check import check, describe
 from refgs.capture.masks import make_masks
@@ -76,6 +77,14 @@ class Train(_Command):
     resume: bool = False
     run: Annotated[str | None, Field(alias="from")] = None
     hints: str | None = None
+
+    def asked(self) -> Asked:
+        """Return what the command asks for. Raises InputError if its keys do not go together."""
+        run, hints = (Path(path) if path else None for path in (self.run, self.hints))
+        changes = tuple(self.settings)
+        return Asked(
+            Path(self.capture), Path(self.out), self.preset, self.device, self.minutes, changes, self.resume, run, hints
+        )
 
 
 class Export(_Command):
@@ -268,30 +277,16 @@ class Worker:
         return "done", make_masks(folder, region, self.send, model) | {"capture": str(folder.resolve())}
 
     def _train(self, command: Train) -> tuple[str, dict]:
-        out = Path(command.out)
+        asked = command.asked()
+        facts = {"run": str(asked.out.resolve()), "iteration": 0, "seconds": 0.0}
         try:
-            return self._train_into(out, command)
+            state, quality = train_job.train(asked, self._hear_training, self._attend)
         except _Ended:
-            return "cancelled", {"run": str(out.resolve()), "iteration": 0, "seconds": 0.0}
-
-    def _train_into(self, out: Path, command: Train) -> tuple[str, dict]:
-        run, hints = (Path(path) if path else None for path in (command.run, command.hints))
-        state, quality = train_job.train(
-            Path(command.capture),
-            out,
-            command.preset,
-            command.device,
-            command.minutes,
-            command.settings,
-            command.resume,
-            self._hear_training,
-            self._attend,
-            train_job.hinted(run, hints, command.resume),
-        )
-        facts = {"run": str(out.resolve()), "iteration": state.iteration, "seconds": state.seconds}
+            return "cancelled", facts
+        facts |= {"iteration": state.iteration, "seconds": state.seconds}
         if not state.ended:
             return "cancelled", facts
-        needs = read_json(out / "needs.json", Needs, "Train again.").root
+        needs = read_json(asked.out / "needs.json", Needs, "Train again.").root
         left_out = [need.model_dump(exclude_unset=True) for need in needs if not need.needed]
         return "done", facts | {"psnr": quality, "left_out": left_out}
 
@@ -352,7 +347,7 @@ class Worker:
         from refgs.batch.batch import ready
         from refgs.batch.listing import Ask
 
-        train_job.check_device(command.device)
+        check_device(command.device)
         source, out, ask = Path(command.captures), Path(command.out), Ask(preset=command.preset)
         counts = {}
 

@@ -159,7 +159,8 @@ def train_with_hint(
     out = _free(folder, {Path(known.folder) for known in scene.refgs.runs})
     file = hints_file(out)
     write_hint(file, kind, points)
-    job = jobs.train(trainer, capture, out, log_file(out.name), mesh=scene.refgs.mesh, hinted=(folder, file))
+    asked = jobs.Asked(capture, out, hinted=(folder, file))
+    job = jobs.train(trainer, asked, log_file(out.name), scene.refgs.mesh)
     _remember(scene, out, capture)
     follow_jobs()
     return job
@@ -178,13 +179,9 @@ def train(scene: bpy.types.Scene) -> jobs.Job:
 def _train(scene: bpy.types.Scene, out: Path, changes: dict[str, object]) -> jobs.Job:
     """Start a job that trains into the folder `out` with the scene's settings and some `changes` of the trainer's settings."""
     settings, capture = scene.refgs, _capture(scene)
-    words = {
-        "preset": None if settings.limited else settings.preset,
-        "minutes": settings.minutes if settings.limited else None,
-        "mesh": settings.mesh,
-        "settings": region_settings(scene) | _choices(settings) | changes,
-    }
-    job = jobs.train(python(), capture, out, log_file(out.name), **words)
+    preset, minutes = (None, settings.minutes) if settings.limited else (settings.preset, None)
+    asked = jobs.Asked(capture, out, preset, minutes, region_settings(scene) | _choices(settings) | changes)
+    job = jobs.train(python(), asked, log_file(out.name), settings.mesh)
     number = scene.session_uid
 
     def masked(found: dict) -> None:
@@ -245,8 +242,8 @@ def resume(scene: bpy.types.Scene, folder: Path) -> jobs.Job:
         raise InputError(f"{folder} is being trained already by another process: stop that or wait for it")
     if known is None or state != "stopped":
         raise InputError(f"{folder} has no stopped training to resume: start a new one")
-    mesh = scene.refgs.mesh
-    job = jobs.train(python(), Path(known.capture), folder, log_file(folder.name), mesh=mesh, resume=True)
+    asked = jobs.Asked(Path(known.capture), folder, resume=True)
+    job = jobs.train(python(), asked, log_file(folder.name), scene.refgs.mesh)
     follow_jobs()
     return job
 

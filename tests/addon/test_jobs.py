@@ -15,10 +15,11 @@ from tests.makers.waiting import final_state, until
 
 @pytest.fixture
 def start(python, tmp_path):
-    def start(name="good", out="run", **words):
+    def start(name="good", out="run", mesh=True, **words):
         capture = tmp_path / f"{name} photos"
         capture.mkdir(exist_ok=True)
-        return jobs.train(python, capture, tmp_path / out, tmp_path / "logs" / f"{out}.txt", **words)
+        asked = jobs.Asked(capture, tmp_path / out, **words)
+        return jobs.train(python, asked, tmp_path / "logs" / f"{out}.txt", mesh)
 
     return start
 
@@ -117,7 +118,7 @@ import sys, time
 from pathlib import Path
 from refgs_addon import jobs
 python, capture, out, kept = sys.argv[1:]
-job = jobs.train(Path(python), Path(capture), Path(out), Path(out + ".txt"), mesh=False)
+job = jobs.train(Path(python), jobs.Asked(Path(capture), Path(out)), Path(out + ".txt"), mesh=False)
 job.keep(kept == "kept")
 asked = False  # once: an answer to a second request may find Blender gone, and would end the trainer before its checkpoint
 while job.state != "paused":

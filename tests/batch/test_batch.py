@@ -15,6 +15,7 @@ from filelock import FileLock
 
 from benchmarks.many import MADE
 from refgs import commands
+from refgs.asked import Asked
 from refgs.batch import engine
 from refgs.errors import InputError
 from refgs.paths import ROOT
@@ -78,7 +79,7 @@ def test_stopped_resumed_killed_and_added_to(shelf, ball_capture):
         masks = (out / "logs" / name / "masks.log").read_text()
         assert masks.count("$ refgs masks") == 1  # done once, and not again by the batch that went on
 
-    commands.train(ball_capture, shelf / "plain", "quick", "cpu", None, CHANGES, resume=False)
+    commands.train(Asked(ball_capture, shelf / "plain", "quick", "cpu", changes=tuple(CHANGES)))
     commands.export(shelf / "plain")
     for file in MADE:
         plain = (shelf / "plain" / file).read_bytes()

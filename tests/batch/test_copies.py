@@ -16,6 +16,7 @@ import pytest
 
 from benchmarks.many import MADE
 from refgs import commands
+from refgs.asked import Asked
 from refgs.batch import copies
 from refgs.batch.copies import Depot, at_hand, list_files, remove_copies
 from refgs.errors import InputError, TryAgain
@@ -109,7 +110,7 @@ def test_machines_that_share_nothing_make_the_same_asset(ball_capture, tmp_path,
         assert status == 0, said
         assert not any(Path(f"/proc/{second.pid}/root{shelf}").iterdir())
     assert "resumed" in (out / "logs" / "ball" / "train.log").read_text()
-    commands.train(ball_capture, tmp_path / "plain", "quick", "cpu", None, CHANGES, resume=False)
+    commands.train(Asked(ball_capture, tmp_path / "plain", "quick", "cpu", changes=tuple(CHANGES)))
     commands.export(tmp_path / "plain")
     for file in MADE:
         assert (out / "ball" / file).read_bytes() == (tmp_path / "plain" / file).read_bytes(), file

@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks import harness, paper
 from refgs import commands
+from refgs.asked import Asked
 from refgs.errors import InputError
 from tests.makers.captures import colmap, nero, shiny_blender, stanford_orb, tensoir
 
@@ -182,7 +183,7 @@ def measure_tiny(tmp_path, monkeypatch):
     def call(what, folder, *options):
         if what == "train":
             assert options[0] == "--out" and options[2:4] == ("--preset", str(preset))
-            commands.train(folder, options[1], str(preset), "cpu", None, [options[5]], False)
+            commands.train(Asked(folder, options[1], str(preset), "cpu", changes=(options[5],)))
         else:
             commands.evaluate(folder, "test", None)
         return 0

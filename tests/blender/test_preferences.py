@@ -71,7 +71,7 @@ def test_why_it_cannot_be_installed(online, python, monkeypatch, tmp_path):
     assert not poll() and "A Python is chosen" in preferences.installation_problem()
     preferences.preferences().python = ""
     (tmp_path / "photos").mkdir()
-    jobs.train(python, tmp_path / "photos", tmp_path / "run", tmp_path / "log.txt")
+    jobs.train(python, jobs.Asked(tmp_path / "photos", tmp_path / "run"), tmp_path / "log.txt")
     assert not poll() and "trainer is running" in preferences.installation_problem()
     with pytest.raises(InputError, match="trainer is running"):
         preferences.remove()

@@ -12,7 +12,7 @@ from PIL import Image
 from refgs import commands
 from refgs.camera import Camera
 from refgs.capture import masks as making
-from refgs.capture import read_capture, silhouettes
+from refgs.capture import read_capture, silhouettes, to_run_frame
 from refgs.capture.backdrop import HIDDEN, Backdrop, Plane, find_plane
 from refgs.capture.images import read_image
 from refgs.capture.masks import make_masks, region_settings
@@ -23,10 +23,12 @@ from tests.makers.captures import (
     CENTRE,
     ball,
     ball_normals,
+    bits,
     colmap,
     edit,
     look_at,
     nerfstudio,
+    nero,
     ring,
     write,
     write_as_phone,
@@ -41,6 +43,19 @@ def coarse(monkeypatch):
     """Carve a coarse grid in few rounds, which is enough for balls of 30 pixels."""
     monkeypatch.setattr(silhouettes, "GRID", 24)
     monkeypatch.setattr(silhouettes, "ROUNDS", 3)
+
+
+@pytest.fixture(autouse=True)
+def compared(monkeypatch):
+    """Compare each capture that gets masks with the same capture when it is read anew: bit for bit."""
+    real = making.with_masks
+
+    def with_masks(*arguments):
+        files, found = real(*arguments)
+        assert bits(to_run_frame(files)) == bits(read_capture(files.folder))
+        return files, found
+
+    monkeypatch.setattr(making, "with_masks", with_masks)
 
 
 def washer(pose, width, height, focal):
@@ -212,6 +227,15 @@ def test_photos_with_opaque_alpha_get_masks(tmp_path):
     make_masks(tmp_path, None, silent)
     assert min(overlap(read_masks(tmp_path), truths)) > 0.9
     assert read_capture(tmp_path).masked
+
+
+def test_masks_are_not_made_where_they_would_not_be_read(tmp_path):
+    folder = nero(tmp_path / "bell")
+    for depth in folder.glob("*-depth.png"):
+        depth.unlink()
+    with pytest.raises(InputError, match="the masks of a nero capture are its depth maps"):
+        make_masks(folder, None, silent)
+    assert not (folder / "masks").exists()
 
 
 def test_interrupted_call_leaves_the_masks_of_before(tmp_path, monkeypatch):

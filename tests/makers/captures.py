@@ -3,6 +3,7 @@
 import json
 import pickle
 import struct
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,15 @@ from refgs.formats.exr import write_exr
 CENTRE = np.array([1.0, 2.0, 3.0])
 RADIUS = 0.5
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def bits(value: object) -> object:
+    """Return a value with all that it holds in a form that can be compared: arrays as their bytes, captures and views as tuples."""
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if is_dataclass(value):
+        return tuple(bits(getattr(value, field.name)) for field in fields(value))
+    return [bits(one) for one in value] if isinstance(value, list) else value
 
 
 def look_at(position: ArrayLike, target: ArrayLike = (0, 0, 0)) -> np.ndarray:

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from refgs import train_job
+from refgs.asked import Asked
 from refgs.capture import cached
 from refgs.train.decide.object_size import object_size
 from refgs.train.learn import coarse
@@ -126,11 +127,9 @@ def test_large_photos_are_held_once_and_leave_no_files(ball_capture, tmp_path, l
     few = [*FEW, "train.iterations=20", "surfels.start=600", "surfels.budget=800", "surfels.hull=48"]
 
     def train(folder, resume=False, until=1000):
-        changes = [] if resume else few
-        quiet = lambda event, facts: None  # noqa: E731
-        return train_job.train(
-            ball_capture, folder, "quick", "cpu", None, changes, resume, quiet, lambda state: state.iteration == until
-        )[0]
+        asked = Asked(ball_capture, folder, "quick", "cpu", changes=tuple(few))
+        asked = asked.resumed() if resume else asked
+        return train_job.train(asked, lambda event, facts: None, lambda state: state.iteration == until)[0]
 
     held = train(tmp_path / "held")
     monkeypatch.setattr(cached, "LARGE", 0)
@@ -156,7 +155,5 @@ def test_photos_that_could_not_all_be_read_leave_no_files(ball_capture, tmp_path
 
     monkeypatch.setattr(cached, "load_view", broken)
     with pytest.raises(KeyboardInterrupt):
-        train_job.train(
-            ball_capture, tmp_path / "run", "quick", "cpu", None, [], False, lambda *a: None, lambda s: False
-        )
+        train_job.train(Asked(ball_capture, tmp_path / "run", "quick", "cpu"), lambda *a: None, lambda s: False)
     assert not (tmp_path / "run" / "photos").exists()

@@ -5,6 +5,7 @@ import subprocess
 import pytest
 
 from refgs import commands, train_job
+from refgs.asked import Asked
 from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.export.export_job import export
@@ -16,7 +17,8 @@ SMALL = ["surfels.start=500", "surfels.budget=500", "surfels.hull=48", "environm
 
 
 def train(capture, run, attend, *changes, resume=False):
-    return train_job.train(capture, run, "quick", "cpu", None, [*changes], resume, lambda event, facts: None, attend)
+    asked = Asked(capture, run, "quick", "cpu", changes=changes, resume=resume)
+    return train_job.train(asked, lambda event, facts: None, attend)
 
 
 def test_a_disk_that_is_taken_out(ball_capture, tmp_path):

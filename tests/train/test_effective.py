@@ -6,6 +6,7 @@ For each it records the requested value, the value in effect, and the reason.
 import tomllib
 
 from refgs import train_job
+from refgs.asked import Asked
 from refgs.capture import read_capture
 from refgs.run import create_run, open_run, record_changes
 from refgs.run_folder import read_run_facts
@@ -49,17 +50,16 @@ def test_a_run_says_what_changed_its_settings(ball_capture, tmp_path):
 
     The training changes settings to suit the photos, or to leave out a part of the method that the scene does not need.
     """
-    out, words = tmp_path / "run", [*SMALL, "train.iterations=40", "needs.specular=off"]
-    train_job.train(
-        ball_capture, out, "quick", "cpu", None, words, False, lambda *_: None, lambda state: state.iteration == 30
-    )
+    out, words = tmp_path / "run", (*SMALL, "train.iterations=40", "needs.specular=off")
+    asked = Asked(ball_capture, out, "quick", "cpu", changes=words)
+    train_job.train(asked, lambda *_: None, lambda state: state.iteration == 30)
     rows, settings = changed(out), read_run_facts(out)[1]
     assert rows["light.frame"]["asked"] == "auto" and rows["light.frame"]["by"] == "photos"
     assert rows["light.frame"]["became"] == settings.light.frame == "world"
     assert rows["render.reflection"]["asked"] == "microfacet" and rows["render.reflection"]["by"] == "needs"
     assert (rows["train.iterations"]["asked"], rows["train.iterations"]["became"]) == (40, 32)
     assert "environment.resolution" not in rows
-    train_job.train(ball_capture, out, None, "cpu", None, [], True, lambda *_: None, lambda _: False)
+    train_job.train(asked.resumed(), lambda *_: None, lambda _: False)
     ended = changed(out)
     assert {key: ended[key] for key in rows} == rows and read_run_facts(out)[1] == settings
     assert open_run(out).splats is not None

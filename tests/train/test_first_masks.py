@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from refgs import train_job
+from refgs.asked import Asked
 from refgs.capture import masks, read_capture, silhouettes
+from refgs.capture import nerfstudio as nerfstudio_reader
 from refgs.capture.check import describe
 from refgs.errors import InputError
 from refgs.settings import load_settings
-from tests.makers.captures import CENTRE, edit, look_at, nerfstudio
+from tests.makers.captures import CENTRE, bits, edit, look_at, nerfstudio
 from tests.makers.unmasked import COUNT, photograph
 
 FEW = ["train.iterations=40", "image.max_side=64", "surfels.start=400", "surfels.budget=400", "surfels.hull=32"]
@@ -29,12 +31,12 @@ def coarse(monkeypatch):
 def train(capture, out, *changes, resume=False, minutes=None, until=10**9):
     """Train, stop after `until` iterations, and return the state and the events."""
     heard = []
-    words = [] if resume else [*FEW, *changes]
-    preset = None if minutes else "quick"
+    asked = Asked(capture, out, None if minutes else "quick", "cpu", minutes, (*FEW, *changes))
     state, _ = train_job.train(
-        capture, out, preset, "cpu", minutes, words, resume, lambda *event: heard.append(event),
+        asked.resumed() if resume else asked,
+        lambda *event: heard.append(event),
         lambda state: state.iteration >= until,
-    )  # fmt: skip
+    )
     return state, heard
 
 
@@ -71,6 +73,16 @@ def test_the_object_is_trained_alone_and_a_resumed_training_keeps_its_masks(tmp_
     assert not events(train(capture, tmp_path / "other")[1], "masks")
 
 
+def test_the_capture_is_read_once(tmp_path, monkeypatch):
+    photograph(tmp_path / "photos")
+    read, real = [], nerfstudio_reader.read_views
+    monkeypatch.setattr(nerfstudio_reader, "read_views", lambda *given: read.append(given) or real(*given))
+    state, _ = train(tmp_path / "photos", tmp_path / "run", until=1)
+    assert len(read) == 1 and state.capture.masked
+    anew = read_capture(tmp_path / "photos", state.settings.region)
+    assert bits(state.capture) == bits(anew) and state.capture.fingerprint() == anew.fingerprint()
+
+
 def test_off_learns_all_that_the_photos_show(tmp_path):
     photograph(tmp_path / "photos")
     state, heard = train(tmp_path / "photos", tmp_path / "run", "image.masks=off")
@@ -94,19 +106,19 @@ def test_masks_are_made_in_the_box_which_stays_about_the_object(tmp_path):
         [1.1 / np.linalg.norm(to_capture[:3, 0])] * 3
     )
     # The run's own settings read its capture as it was trained.
-    settings = train_job.read_run_facts(tmp_path / "run")[1]
-    assert read_capture(capture, settings.region).fingerprint() == state.capture.fingerprint()
+    anew = read_capture(capture, train_job.read_run_facts(tmp_path / "run")[1].region)
+    assert bits(anew) == bits(state.capture) and anew.fingerprint() == state.capture.fingerprint()
 
 
 def test_the_time_for_masks_counts(tmp_path, monkeypatch):
     photograph(tmp_path / "photos")
-    make, spent = masks.make_masks, 8.0
+    make, spent = masks.with_masks, 8.0
 
     def slow(*arguments):
         time.sleep(spent)
         return make(*arguments)
 
-    monkeypatch.setattr(masks, "make_masks", slow)
+    monkeypatch.setattr(masks, "with_masks", slow)
     begun = time.perf_counter()
     train(tmp_path / "photos", tmp_path / "run", minutes=0.4)
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())

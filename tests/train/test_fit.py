@@ -7,8 +7,10 @@ from itertools import pairwise
 import pytest
 
 from refgs import train_job
+from refgs.asked import Asked
 from refgs.capture import read_capture
 from refgs.settings import load_settings
+from refgs.train.effective import Effective
 from refgs.train.fit import FASTEST, REHEARSED, _scheduled, between, fitting
 from refgs.train.plan import Plan
 
@@ -47,7 +49,8 @@ def test_more_time_brings_more_of_all(ball_capture, tmp_path):
     said, found = [], []
     for minutes in (0.2, 2, 6, 600):
         report = lambda event, facts: said.append(facts["what"])  # noqa: E731
-        made = fitting(capture, ["surfels.hull=32"], tmp_path, Plan(minutes), "cpu", report)
+        quick, standard = (load_settings(preset, ["surfels.hull=32"]) for preset in ("quick", "standard"))
+        made = fitting(capture, Effective.of(quick), standard, tmp_path, Plan(minutes), "cpu", report)
         found.append(made.state.settings)
         assert made.state.total == made.state.settings.train.iterations and made.state.report is report
         if made.state.settings.surfels.budget == QUICK.surfels.budget:  # the rehearsal's iterations count as done
@@ -75,8 +78,8 @@ def test_more_time_brings_more_of_all(ball_capture, tmp_path):
 def test_a_training_with_nothing_but_a_time_is_planned(ball_capture, tmp_path):
     said = []
     report = lambda event, facts: said.append(facts.get("what", ""))  # noqa: E731
-    out, few = tmp_path / "run", ["surfels.hull=32", "surfels.start=800", "surfels.budget=1000"]
-    made, _ = train_job.train(ball_capture, out, None, "cpu", 0.15, few, False, report, lambda _: False)
+    out, few = tmp_path / "run", ("surfels.hull=32", "surfels.start=800", "surfels.budget=1000")
+    made, _ = train_job.train(Asked(ball_capture, out, None, "cpu", 0.15, few), report, lambda _: False)
     assert made.ended and sum(line.startswith("planned for 0.15 minutes") for line in said) == 1
     facts = tomllib.loads((out / "run.toml").read_text(encoding="utf-8"))
     assert facts["run"]["preset"] == "0.15 minutes"

@@ -15,6 +15,7 @@ import resource, sys
 from pathlib import Path
 import torch
 from refgs import train_job
+from refgs.asked import Asked
 from refgs.errors import InputError
 
 def attend(state):
@@ -22,9 +23,10 @@ def attend(state):
         resource.setrlimit(resource.RLIMIT_AS, (1 << 35, resource.RLIM_INFINITY))
         torch.empty(1 << 36, dtype=torch.uint8)
 
-changes = ["surfels.start=500", "surfels.budget=500", "surfels.hull=48", "environment.resolution=16", "train.iterations=10"]
+changes = ("surfels.start=500", "surfels.budget=500", "surfels.hull=48", "environment.resolution=16", "train.iterations=10")
+asked = Asked(Path(sys.argv[1]), Path(sys.argv[2]), "quick", "cpu", changes=changes)
 try:
-    train_job.train(Path(sys.argv[1]), Path(sys.argv[2]), "quick", "cpu", None, changes, False, lambda *_: None, attend)
+    train_job.train(asked, lambda *_: None, attend)
 except InputError as error:
     print(error)
 """

@@ -8,6 +8,7 @@ import torch
 
 from benchmarks.scenes.analytic import write_ball_capture
 from refgs import train_job
+from refgs.asked import Asked
 from refgs.errors import InputError
 from refgs.formats.hints import FILE, Hint, read_hints, write_hints
 from refgs.formats.needs import Found
@@ -60,8 +61,8 @@ def hint_file(run, **words):
 
 
 def go_on(capture, out, run, file, *, minutes=None, attend=lambda state: False, resume=False):
-    hinted = None if resume else train_job.Hinted(run, file)
-    return train_job.train(capture, out, None, "cpu", minutes, [], resume, silent, attend, hinted)
+    hinted = {"resume": True} if resume else {"run": run, "hints": file}
+    return train_job.train(Asked(capture, out, None, "cpu", minutes, **hinted), silent, attend)
 
 
 def count(state, raw) -> int:
@@ -122,8 +123,11 @@ def test_hinted_halves_are_held_and_so_they_are_after_a_resume(plastic, ball_cap
     with torch.no_grad():
         divided = densify(state.learned, gradient, state.settings.densify, 2 * len(gradient), divide=True)
     assert divided and count(state, METAL) + count(state, PAINT) == len(state.learned["metallic"])
+    once = Asked(ball_capture, out, None, "cpu", run=run, hints=file)
+    assert train_job.unfinished(once) is True
     state, quality = go_on(ball_capture, out, run, None, resume=True)
     assert state.ended and quality is not None
+    assert train_job.unfinished(once) is None
     assert count(state, METAL) + count(state, PAINT) == len(state.learned["metallic"])
 
 
@@ -188,9 +192,7 @@ def test_what_cannot_be_continued(plastic, ball_capture, tmp_path):
     with pytest.raises(InputError, match="has no checkpoint to continue from"):
         go_on(ball_capture, tmp_path / "new", dull.state.folder, file)
     with pytest.raises(InputError, match="keeps its settings"):
-        train_job.train(
-            ball_capture, tmp_path / "new", None, "cpu", None, TINY, False, silent, None, train_job.Hinted(run, file)
-        )
+        Asked(ball_capture, tmp_path / "new", changes=tuple(TINY), run=run, hints=file)
     with pytest.raises(InputError, match="holds another run"):
         go_on(ball_capture, dull.state.folder, run, file)
 

@@ -3,6 +3,7 @@
 import pytest
 
 from refgs import train_job
+from refgs.asked import Asked
 from refgs.errors import InputError, TryAgain
 from tests.makers.kills import CHANGES, files
 
@@ -19,10 +20,9 @@ def check_same(run, whole):
 
 
 def train(capture, run, attend=lambda state: False, resume=False):
-    changes = [] if resume else CHANGES
-    said = []
-    words = capture, run, None if resume else "quick", "cpu", None, changes, resume
-    train_job.train(*words, lambda event, facts: said.append((event, facts.get("what", ""))), attend)
+    asked, said = Asked(capture, run, "quick", "cpu", changes=tuple(CHANGES)), []
+    asked = asked.resumed() if resume else asked
+    train_job.train(asked, lambda event, facts: said.append((event, facts.get("what", ""))), attend)
     return said
 
 

@@ -9,6 +9,7 @@ from PIL import Image
 
 from benchmarks.scenes.analytic import TWO, camera_matrix, photo, write_ball_capture
 from refgs import commands, train_job
+from refgs.asked import Asked
 from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.formats.gltf import read_glb
@@ -36,9 +37,8 @@ def balls(request, tmp_path_factory):
 
 
 def train(capture, out, *changes):
-    return train_job.train(
-        capture, out, "quick", "cpu", None, [*CHANGES, *changes], False, lambda *_: None, lambda state: False
-    )
+    asked = Asked(capture, out, "quick", "cpu", changes=(*CHANGES, *changes))
+    return train_job.train(asked, lambda *_: None, lambda state: False)
 
 
 @pytest.fixture(scope="module")

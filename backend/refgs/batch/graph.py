@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
+from refgs.asked import Asked
 from refgs.batch.listing import LOGS, Job
 from refgs.batch.steps import Step
 from refgs.capture import find_layout
@@ -41,20 +42,16 @@ def steps_of(job: Job, out: Path, device: str) -> list[Node]:
         log = logs / owner / f"{name}.log"
         return Step(name, owner, (name, *words, "--once"), log, made, reads, (written, log.parent))
 
-    how = [
-        *(("--preset", preset) if preset else ()),
-        *(("--minutes", f"{ask.minutes:g}") if ask.minutes else ()),
-    ]
-    how += [word for change in ask.set for word in ("--set", change)]
+    asked = Asked(job.capture, run, preset, device, ask.minutes, tuple(ask.set))
     nodes, before = [], ()
     if find_layout(job.capture) is None:
         nodes, before = [Node(step("poses", capture))], ("poses",)
     masks: tuple[str, ...] = ()
-    settings = job.settings()
+    settings = asked.settings()
     # A box is given in the frame without masks, which masks may move: there the training makes them, and moves the box.
     if settings.image.masks == "auto" and not any(settings.region.size):
         nodes, masks = [*nodes, Node(step("masks", capture), before)], ("masks",)
-    train = step("train", capture, "--out", str(run), "--device", device, *how, made=run / "splats.ply")
+    train = step(*asked.words(), made=run / "splats.ply")
     return [
         *nodes,
         Node(train, before, masks),

@@ -31,7 +31,7 @@ from refgs.capture.region import (
 )
 from refgs.capture.stanford_orb import NOVEL, read_stanford_orb
 from refgs.capture.tensoir import is_tensoir, read_tensoir
-from refgs.capture.types import Z_UP, Capture, View
+from refgs.capture.types import Z_UP, Capture, CaptureFiles, View
 from refgs.errors import InputError, NoCameras
 from refgs.paths import check_folder, check_unicode, command_line
 from refgs.settings import RegionSettings
@@ -39,6 +39,7 @@ from refgs.settings import RegionSettings
 __all__ = [
     "Box",
     "Capture",
+    "CaptureFiles",
     "LoadedView",
     "View",
     "find_layout",
@@ -46,14 +47,15 @@ __all__ = [
     "load_normals",
     "load_view",
     "load_views",
-    "mask_files",
     "published_normals",
     "read_cameras",
     "read_capture",
+    "read_files",
     "read_run_cameras",
     "reduced_views",
     "release_memory",
     "remove_cached",
+    "to_run_frame",
     "write_cameras",
 ]
 
@@ -81,6 +83,11 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
     without `wanted`. Only the photos' headers and some masks are read; photos are not decoded.
     Raises InputError with a message of one line.
     """
+    return to_run_frame(read_files(folder), wanted)
+
+
+def read_files(folder: Path) -> CaptureFiles:
+    """Read the photos' cameras from a capture's folder, in the capture's own coordinates. No photo and no mask is decoded."""
     folder = Path(folder)
     layout = _check_layout(folder)
     views, points, colors, warnings = _read(folder, layout)
@@ -90,7 +97,13 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
     _check_cameras(folder, views)
     views = _unique_names(views)
     views = with_priors(views, masks_root(find_model(folder)[0]) if layout == "colmap" else folder)
-    views, silhouettes, white = _silhouettes(views)
+    return CaptureFiles(folder, layout, views, points, colors, [*warnings, *shared])
+
+
+def to_run_frame(files: CaptureFiles, wanted: RegionSettings | None = None) -> Capture:
+    """Convert what was read of a capture to the run's frame. `wanted` is as for `read_capture`. Some masks are read."""
+    folder, layout, points = files.folder, files.layout, files.points
+    views, silhouettes, white = _silhouettes(files.views)
     up = up_direction(views)
     region = find_region(views, up, points, silhouettes)
     to_capture, unit = _run_frame(layout, region, up)
@@ -106,7 +119,7 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
         views=views,
         to_capture=to_capture,
         points=points,
-        point_colors=colors,
+        point_colors=files.colors,
         bounded=region.bounded,
         bounded_because=region.because,
         centre=region.centre,
@@ -114,14 +127,9 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
         reach=reach,
         box=box,
         digest=_digest(folder, layout, views),
-        warnings=[*warnings, *shared, *white],
+        warnings=[*files.warnings, *white],
     )
     return capture if np.array_equal(to_capture, np.eye(4)) else _in_run_frame(capture, unit)
-
-
-def mask_files(folder: Path) -> list[Path]:
-    """Return the mask files of a capture, also those that `read_capture` does not use because all are white."""
-    return [view.mask_path for view in _read(folder, _check_layout(folder))[0] if view.mask_path is not None]
 
 
 def _check_layout(folder: Path) -> str:

@@ -10,7 +10,6 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from PIL import Image
 from pydantic import TypeAdapter
 
 from refgs.camera import Camera
-from refgs.capture import View, load_view, mask_files, read_capture
+from refgs.capture import View, load_view, read_files, to_run_frame
 from refgs.capture.backdrop import Backdrop, find_plane
 from refgs.capture.box import Box
 from refgs.capture.colmap import find_model, masks_root
@@ -31,8 +30,9 @@ from refgs.capture.region import LOOK_OUT, WHITE_MASKS, find_region, sample_silh
 from refgs.capture.salience import SalienceModel
 from refgs.capture.silhouettes import Photo, carve_object, cut_out
 from refgs.capture.triangulate import triangulate
-from refgs.capture.types import Z_UP, Capture
+from refgs.capture.types import Z_UP, Capture, CaptureFiles
 from refgs.errors import InputError
+from refgs.events import Report
 from refgs.paths import hash_file, read_text, write_text
 from refgs.settings import RegionSettings
 
@@ -49,7 +49,7 @@ class ReadOnlyError(InputError):
 def make_masks(
     folder: Path,
     wanted: RegionSettings | None,
-    report: Callable[[str, dict[str, Any]], None],
+    report: Report,
     model: Path | None = None,
 ) -> dict[str, Any]:
     """Make the masks of a capture's photos, and write them to its folder `masks`.
@@ -66,14 +66,24 @@ def make_masks(
     artist, if these are all white, if strokes or the model do not fit, or if nothing is found, and ReadOnlyError if the folder cannot be
     written to.
     """
-    folder = Path(folder)
+    return with_masks(read_files(folder), wanted, report, model)[1]
+
+
+def with_masks(
+    files: CaptureFiles,
+    wanted: RegionSettings | None,
+    report: Report,
+    model: Path | None = None,
+) -> tuple[CaptureFiles, dict[str, Any]]:
+    """Make masks as `make_masks` does, of a capture that was read. Return the capture with its new masks, and what `make_masks` returns."""
+    folder = files.folder
     judge = _Judge(SalienceModel(model)) if model is not None else None
-    capture = read_capture(folder, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
+    capture = to_run_frame(files, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
     root = _root(capture)
     _check_writable(root)
     made = _hashes(root)
     if WHITE_MASKS in capture.warnings:
-        _check_white(folder, made)
+        _check_white(files, made)
     views = [replace(v, mask_path=None) if v.mask_path and _hash(v.mask_path) in made else v for v in capture.views]
     if all(view.masked for view in views):
         raise InputError(f"{folder}: every photo has a mask that was not made here. Remove those that you want made.")
@@ -115,26 +125,31 @@ def make_masks(
     work = root / "masks.tmp"
     shutil.rmtree(work, ignore_errors=True)
     try:
-        files, found = {}, False
+        drawn, found = {}, False
         for view, target in targets.items():
             mask = _to_photo(view, cut_out(_load(view, root, FINE, judge), shape))
             found |= bool(mask.any())
             path = work / target.relative_to(root)
             path.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(mask).save(path)
-            files[path] = target
-            report("progress", {"stage": "edges", "done": len(files), "total": len(targets)})
+            drawn[path] = target
+            report("progress", {"stage": "edges", "done": len(drawn), "total": len(targets)})
         if not found and len(targets) == len(views):
             raise nothing
-        masked = {target: path for path, target in files.items()}
+        masked = {target: path for path, target in drawn.items()}
         final = [replace(v, mask_path=masked[targets[v]]) if v in targets else v for v in views]
         if not find_region(final, up_direction(final), None, sample_silhouettes(final)).bounded:
             raise nothing  # the masks do not agree on a solid object
-        _put(files, root, made)
+        _put(drawn, root, made)
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    to_frame = np.linalg.inv(read_capture(folder).to_capture) @ capture.to_capture
-    return {
+    given = [
+        replace(read, mask_path=targets[view], has_alpha=False) if view in targets else read
+        for read, view in zip(files.views, views, strict=True)
+    ]
+    files = files._replace(views=given)
+    to_frame = np.linalg.inv(to_run_frame(files).to_capture) @ capture.to_capture
+    return files, {
         "photos": len(views),
         "made": len(targets),
         "kept": len(views) - len(targets),
@@ -170,6 +185,13 @@ def region_settings(box: Box) -> list[str]:
     ]
 
 
+def moved_region(wanted: RegionSettings, moved: list[list[float]]) -> RegionSettings:
+    """Return a box in the frame that new masks have moved, by the matrix (4, 4) that `make_masks` returns as `moved`."""
+    scale = sum(row[0] ** 2 for row in moved[:3]) ** 0.5
+    centre = tuple(sum(a * b for a, b in zip(row, (*wanted.centre, 1.0), strict=True)) for row in moved[:3])
+    return wanted.model_copy(update={"centre": centre, "size": tuple(scale * edge for edge in wanted.size)})
+
+
 def masks_folder(capture: Capture) -> Path:
     """Return the folder into which a capture's masks are made. Raises InputError if its masks can only be in its photos."""
     return _root(capture) / "masks"
@@ -181,8 +203,9 @@ def _check_writable(root: Path) -> None:
         raise ReadOnlyError(f"{root} is read-only: masks cannot be written to it. Copy the capture.")
 
 
-def _check_white(folder: Path, made: set[str]) -> None:
-    given = [file for file in mask_files(folder) if _hash(file) not in made]
+def _check_white(files: CaptureFiles, made: set[str]) -> None:
+    masks = [view.mask_path for view in files.views if view.mask_path is not None]
+    given = [file for file in masks if _hash(file) not in made]
     if given:
         raise InputError(
             f"{given[0].parent}: all {len(given)} masks are white (opaque) everywhere, {given[0].name} too. "
@@ -195,6 +218,10 @@ def _root(capture: Capture) -> Path:
     if capture.layout in Z_UP:
         raise InputError(
             f"{capture.folder}: the masks of a {capture.layout} capture are its photos' alpha channels. Cut them out there."
+        )
+    if capture.layout == "nero":
+        raise InputError(
+            f"{capture.folder}: the masks of a nero capture are its depth maps, 0-depth.png … Put them there."
         )
     if capture.layout != "colmap":
         return capture.folder

@@ -5,7 +5,7 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -47,6 +47,17 @@ class View:
     def masked(self) -> bool:
         """Tell whether the view has a mask: a mask file, or the photo's alpha channel."""
         return self.mask_path is not None or self.has_alpha
+
+
+class CaptureFiles(NamedTuple):
+    """Hold what the files of a capture say, in the capture's own coordinates. Fields are as those of `Capture`."""
+
+    folder: Path
+    layout: str
+    views: list[View]
+    points: np.ndarray | None
+    colors: np.ndarray | None
+    warnings: list[str]
 
 
 @dataclass(frozen=True, eq=False)

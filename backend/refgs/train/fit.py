@@ -5,7 +5,7 @@ from pathlib import Path
 
 from refgs.capture import Capture
 from refgs.events import Report
-from refgs.settings import RATES, Settings, load_settings, validate
+from refgs.settings import RATES, Settings, validate
 from refgs.train.decide.object_size import object_size, surfel_budget
 from refgs.train.effective import Effective
 from refgs.train.learn import coarse
@@ -18,19 +18,20 @@ FASTEST = 2.0  # times a preset's rates
 RICHER_STEPS, RICHEST = 64, 2.0  # steps in which settings richer than quick are tried, and how far: standard is at one
 
 
-def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, device: str, report: Report) -> Trainer:
+def fitting(
+    capture: Capture, effective: Effective, standard: Settings, folder: Path, plan: Plan, device: str, report: Report
+) -> Trainer:
     """Make a trainer whose settings let the training end within `plan.minutes`.
 
     First, run a few iterations with the preset `quick` to measure how long an iteration takes. Then try settings from `quick` to beyond
     `standard` (see `between`), and choose the most detailed ones whose iterations all fit. If none fit, choose `quick`. Finally,
     set the number of iterations to as many as fit.
 
-    If `quick` is chosen, the training continues after the measured iterations. Otherwise it starts anew. `changes` are the user's settings,
-    such as "train.seed=1".
+    If `quick` is chosen, the training continues after the measured iterations. Otherwise it starts anew. `effective` holds the
+    settings of `quick`, and `standard` those of that preset, both with the user's changes.
     """
-    quick, standard = (load_settings(preset, changes) for preset in ("quick", "standard"))
-    begun, said = plan.spent, []
-    trainer = Trainer(capture, quick, folder, lambda *event: said.append(event), plan, device)
+    quick, begun, said = effective.settings, plan.spent, []
+    trainer = Trainer(capture, effective, folder, lambda *event: said.append(event), plan, device)
     started = plan.spent
     marks = []
     for _ in range(REHEARSED):
@@ -74,7 +75,7 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
     else:
         del trainer  # first, for its memory
         settings = _scheduled(found, count, quick, standard)
-        trainer = Trainer(capture, Effective.of(quick).moved_to(settings, "plan", why), folder, report, plan, device)
+        trainer = Trainer(capture, effective.moved_to(settings, "plan", why), folder, report, plan, device)
     settings = trainer.state.settings
     found = f"{settings.train.iterations:,} iterations, {settings.surfels.budget:,} surfels at most"
     what = f"planned for {plan.minutes:g} minutes: about {found}, photos of {settings.image.max_side} pixels at most"
