@@ -25,7 +25,7 @@ from refgs.train.decide.materials import SHINES
 from refgs.train.keep.asset import write_asset
 from refgs.train.keep.measures import held_out_psnr
 from refgs.train.learn.losses import objective
-from refgs.train.photo import Photo
+from refgs.train.photo import MARGIN, Photo, bounds
 from refgs.train.plan import Plan
 from refgs.train.state import why_not_traced
 from refgs.train.timeline import RESET, SEEN, faint_now
@@ -183,10 +183,10 @@ def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
     for _ in range(10):
         made.step()
     decided = dict(made.state.needs)
-    assert not decided["specular"]["needed"]
+    assert not decided["specular"].needed
     made.resume()
     assert made.state.iteration == 96 and made.state.needs == decided and "metallic" not in made.state.learned
-    assert made.state.total == decided["iterations"]["total"] < 200
+    assert made.state.total == decided["iterations"].total < 200
     made.step()
 
 
@@ -307,7 +307,7 @@ def test_the_part_about_the_mask_is_all_that_counts(ball_capture, tmp_path):
     camera = replace(camera, fx=0.6 * camera.fx, fy=0.6 * camera.fy)
     mask = (made.state.render(camera).alpha > 0).byte() * 255
     whole = Photo(torch.randint(255, (64, 64, 3), dtype=torch.uint8, generator=generator), mask, camera)
-    part = whole.part(*photos.bounds(mask.numpy(), photos.MARGIN))
+    part = whole.part(*bounds(mask.numpy(), MARGIN))
     assert part.image.shape[0] < 64 and part.mask.sum() == mask.sum()
     results = []
     for photo in (whole, part):
@@ -354,11 +354,11 @@ def test_surfels_that_are_faint_decide_nothing_and_are_no_mesh(ball_capture, tmp
 
 def test_what_the_part_about_the_mask_saves_is_timed(ball_capture, tmp_path, monkeypatch):
     monkeypatch.setattr(photos, "MARGIN", 5)
-    monkeypatch.setattr(photos, "TIMED", 3)
     made = trainer(ball_capture, tmp_path / "run", "needs.specular=on", total=20)
     asked = []
     monkeypatch.setattr(probe, "seconds_saved", lambda trainer, whole: asked.append(whole) or 8.0)
-    made.run(stop=lambda: made.state.iteration == 6)
+    for done in (99, 100, 101):
+        do(made.state, "time the crops", done=done)
     # 7/8 of 8 s are saved: one iteration in eight uses the full photo.
     assert asked == [True] and made.state.needs["outside"].seconds == 7.0
     assert next(row for row in needs.rows(made.state) if row["need"] == "outside")["saved"] == "7.0 s, 0.0 MB"

@@ -49,7 +49,7 @@ def fitting(
         # There may be fewer points to start from than the settings ask for.
         start = settings.surfels.start if first == quick.surfels.start else first
         one = pace * (OTHERS + start) / (OTHERS + first) * larger**BY_PIXELS
-        left = 60 * plan.minutes - plan.spent
+        left = 60 * (plan.minutes or 0.0) - plan.spent
         if settings is not quick:
             left -= (started - begun) * larger  # for another start
         more = growth(start, surfel_budget(settings.surfels, size.area * larger))

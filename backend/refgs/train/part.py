@@ -1,33 +1,33 @@
 """Give a part of a training a memory of its own, which checkpoints keep."""
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 
 from refgs.train.state import State
 
-Fact = bool | int | float | str
+Fact = bool | int | Tensor
 
 
 class Part:
     """Remember what one part of a training has found. `state.part(Kind)` returns the part of this kind.
 
-    What is done with it and when is in `train/timeline.py`; a checkpoint has its facts and tensors under its `name`.
+    What is done with it and when is in `train/timeline.py`. A checkpoint has its `facts` under its `name`: numbers in the TOML file, and
+    tensors. By default these are the attributes `saved`, those that are not None.
     """
 
     name: ClassVar[str]
+    saved: ClassVar[tuple[str, ...]] = ()
 
     def start(self, state: State) -> None:
-        """Make the memory. The state has its photos, but may have no surfels yet."""
+        """Make the memory. Photos and surfels are there."""
 
     def facts(self, state: State) -> dict[str, Fact]:
-        """Return what a checkpoint keeps of the memory in its TOML file."""
-        return {}
+        """Return what a checkpoint keeps of the memory."""
+        return {name: value for name in self.saved if (value := getattr(self, name)) is not None}
 
-    def tensors(self, state: State) -> dict[str, Tensor]:
-        """Return what a checkpoint keeps of the memory as tensors."""
-        return {}
-
-    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping[str, Tensor]) -> None:
-        """Take the memory over from a checkpoint. Facts that an earlier release did not write are missing."""
+    def restore(self, state: State, facts: Mapping[str, Any]) -> None:
+        """Take the memory over from a checkpoint."""
+        for name in self.saved:
+            setattr(self, name, facts.get(name))

@@ -26,7 +26,7 @@ class Photo(NamedTuple):
     image: Tensor
     mask: Tensor | None
     camera: Camera
-    whole: tuple[int, int] | None = None
+    whole: tuple[int, ...] | None = None
     white: int = 255
 
     @classmethod
@@ -58,6 +58,12 @@ class Photo(NamedTuple):
     def clipped(self) -> Tensor:
         """Return where each channel (H, W, 3) is clipped, or nearly so: JPEG does not keep the largest code exactly."""
         return self.image.float() >= torch.iinfo(self.image.dtype).max // 255 * 254
+
+
+def crop_of(view: LoadedView, margin: int) -> Crop:
+    """Return the part of a view's photo that shows the object: the bounds of its mask, or the whole photo if it has none."""
+    height, width = view.image.shape[:2]
+    return (slice(0, height), slice(0, width)) if view.alpha is None else bounds(view.alpha, margin)
 
 
 def bounds(mask: np.ndarray, margin: int) -> Crop:

@@ -157,10 +157,8 @@ def pixel_sums(
     features = features.detach().clone().requires_grad_()
     with torch.enable_grad():
         blended = rasterize(*discs(surfels, photo.camera), features, photo.camera, near=near).features
-        (
-            blended * weigh(blended.detach())
-        ).sum().backward()  # without a gradient argument: with one, torch imports sympy (0.5 s)
-    return features.grad
+        # A scalar: given a gradient argument, torch imports sympy (0.5 s).
+        return torch.autograd.grad((blended * weigh(blended.detach())).sum(), features)[0]
 
 
 @torch.no_grad()

@@ -4,7 +4,7 @@ import math
 from functools import partial
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 
 from refgs.capture import Box, Capture, LoadedView
 from refgs.errors import InputError

@@ -20,7 +20,7 @@ from refgs.render.baselines import Method, initial_stage, method_of
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.run_folder import PHOTOS
 from refgs.settings import LossSettings, RenderSettings, Settings
-from refgs.train.effective import Effective
+from refgs.train.effective import By, Effective
 from refgs.train.photo import Crop, Photo
 from refgs.train.plan import Plan
 
@@ -39,6 +39,13 @@ class RenderInputs(NamedTuple):
     environment: Environment | None
     settings: RenderSettings
     occluder: Occluder | None
+
+    @property
+    def light(self) -> Environment:
+        """Return the environment's light. Raises ValueError if the rendering method uses none."""
+        if self.environment is None:
+            raise ValueError("this rendering method uses no light")
+        return self.environment
 
 
 class State:
@@ -178,7 +185,7 @@ class State:
             self.decided[about] = what
             self.report("decided", {"about": about, "what": what})
 
-    def change(self, key: str, value: Any, by: str, why: str) -> None:
+    def change(self, key: str, value: Any, by: By, why: str) -> None:
         """Change a setting for the rest of the training. Its `key` is "section.name".
 
         `by` says what caused the change, and `why` explains it in words.

@@ -4,7 +4,7 @@ The first stage shades each surfel, before blending. The second stage shades eac
 """
 
 from refgs.formats.needs import Found
-from refgs.train.decide.need import ASKED, Decision, Moment, Need
+from refgs.train.decide.need import ASKED, Decision, Given, Moment, Need
 from refgs.train.learn.coarse import cost
 from refgs.train.state import State
 
@@ -20,7 +20,7 @@ class Initial(Need):
         left_out = state.from_hull or self.asked(state) == "off"
         return left_out and state.settings.initial.until > 0 and state.method.deferred
 
-    def measure(self, state: State) -> Decision:
+    def measure(self, state: State, given: Given) -> Decision:
         return Decision(False, ASKED if self.asked(state) == "off" else "surfels start on the hull of the masks")
 
     def apply(self, state: State, found: Found) -> None:
@@ -43,22 +43,22 @@ class Iterations(Need):
         asked = moment == "start" and self.asked(state) == "off"
         return (asked or matte) and state.plan.minutes is None
 
-    def measure(self, state: State, done: int = 0) -> Decision:
-        specular = state.needs.get("specular")
+    def measure(self, state: State, given: Given) -> Decision:
+        done, specular = given.done, state.needs.get("specular")
         total = done + round(self.ENOUGH * (state.total - done))
         left, why = 0.0, ASKED  # seconds
         statistic = threshold = None
         if specular and specular.statistic is not None:
             statistic, threshold = specular.statistic, specular.threshold
             to_come = cost(state, done, state.total) / max(cost(state, 0, done), 1e-9)
-            left = state.seconds * to_come - specular.seconds
+            left = state.seconds * to_come - (specular.seconds or 0.0)
             why = "what mirrors nothing has less to learn"
         figures = {"total": total, "seconds": max(left, 0.0) * (1 - self.ENOUGH)}
         why = f"{why}: {total:,} in place of {state.total:,}"
         return Decision(False, why, figures, statistic, threshold)
 
     def apply(self, state: State, found: Found) -> None:
-        state.total = min(state.total, int(found.total))
+        state.total = min(state.total, int(found.total or state.total))
         state.effective = state.effective.noted("train.iterations", state.total, "needs", found.why)
 
     def undo(self, state: State, why: str) -> None:

@@ -63,7 +63,7 @@ def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.nd
     for number, view in enumerate(views):
         camera = view.camera.fitted(PHOTO_SIDE)
         shown = cv2.resize(view.image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        radiance = srgb_decode(shown.astype(np.float32) / view.white).mean(axis=-1)
+        radiance = np.asarray(srgb_decode(shown.astype(np.float32) / view.white)).mean(axis=-1)
         ahead, behind = _visibility(camera.fitted(coarse), positions, some)
         towards = camera.position - positions[some]
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
@@ -119,6 +119,7 @@ def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray,
         asked = ~known & often[points]
         columns = np.column_stack([values, terms])
         of_photo = np.zeros((photos.max() + 1, columns.shape[1]))
+        of_point = np.zeros((points.max() + 1, columns.shape[1]))
         for _ in range(PASSES):  # means of points and of photos, one after the other
             of_point = _means(columns[known] - of_photo[photos[known]], points[known], points.max() + 1)
             of_photo = _means(columns[known] - of_point[points[known]], photos[known], photos.max() + 1)

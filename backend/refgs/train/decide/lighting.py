@@ -8,7 +8,7 @@ from refgs.formats.needs import Found
 from refgs.model.prefilter import IRRADIANCE_SIDE
 from refgs.train import probe
 from refgs.train.decide.materials import INDIRECT
-from refgs.train.decide.need import ASKED, MEGA, NUMBER, Decision, Moment, Need, megabytes
+from refgs.train.decide.need import ASKED, MEGA, NUMBER, Decision, Given, Moment, Need, megabytes
 from refgs.train.learn import light
 from refgs.train.state import RenderInputs, State
 
@@ -30,15 +30,16 @@ class Reflections(Need):
         return moment == "mesh" or self.asked(state) == "off"
 
     @torch.no_grad()
-    def measure(self, state: State, hidden: float = 0.0) -> Decision:
+    def measure(self, state: State, given: Given) -> Decision:
         """Decide by two measurements whether inter-reflection is needed.
 
-        The first is `hidden`, the fraction of the object's pixels that mirror the object itself. The second is how many dB inter-reflection
-        can gain. Both must reach a threshold, over the whole object or in a small part of it. Nothing is measured if the user's setting is
-        "off".
+        The first is `given.hidden`, the fraction of the object's pixels that mirror the object itself. The second is how many dB
+        inter-reflection can gain. Both must reach a threshold, over the whole object or in a small part of it. Nothing is measured if the
+        user's setting is "off".
         """
         if self.asked(state) == "off":
             return Decision(False, ASKED)
+        hidden = given.hidden
         why, least = share_hidden(hidden), state.settings.indirect.least
         if hidden < self.HOLLOW * least:
             return Decision(False, why, self._saved(state), hidden, self.HOLLOW * least)
@@ -84,7 +85,7 @@ class Light(Need):
         return moment == "light"
 
     @torch.no_grad()
-    def measure(self, state: State) -> Decision:
+    def measure(self, state: State, given: Given) -> Decision:
         inputs, finest = state.inputs(), state.settings.environment.resolution
         coarsest, least = min(IRRADIANCE_SIDE, finest), None
         if inputs.settings.reflection == "none":
@@ -100,10 +101,10 @@ class Light(Need):
             least = math.sqrt(math.pi / 2 / (finest // 2) / self.LOBE)
         if side >= finest:
             return Decision(True, why, {}, roughness, least)
-        side = min(side, inputs.environment.resolution)
+        side = min(side, inputs.light.resolution)
 
         def coarse(inputs: RenderInputs) -> RenderInputs:
-            return inputs._replace(environment=probe.pooled(inputs.environment, side))
+            return inputs._replace(environment=probe.pooled(inputs.light, side))
 
         loss = probe.psnr_loss(state, coarse)
         if (loss.whole > self.threshold or loss.part > VISIBLE) and self.asked(state) == "auto":
@@ -114,7 +115,7 @@ class Light(Need):
         return Decision(False, why, figures, roughness, least, lambda: light.coarsen(state, side))
 
     def apply(self, state: State, found: Found) -> None:
-        state.change("environment.resolution", int(found.side), "needs", found.why)
+        state.change("environment.resolution", int(found.side or 0), "needs", found.why)
 
     def undo(self, state: State, why: str) -> None:
         state.change("environment.resolution", state.effective.asked.environment.resolution, "needs", why)
@@ -144,14 +145,14 @@ class Degrees(Need):
     moments = ("degrees",)
 
     @torch.no_grad()
-    def measure(self, state: State) -> Decision:
+    def measure(self, state: State, given: Given) -> Decision:
         figures, why, counts = {"seconds": 0.0, "megabytes": 0.0, "decibels": 0.0}, [], {}
         inputs = state.inputs()
         for field, name in (("sh_rest", "what is left over"), ("indirect_rest", "inter-reflection")):
             if field not in state.learned:
                 continue
             whole = state.learned[field].shape[1]
-            count, loss, shorter = whole, 0.0, inputs
+            count, loss, shorter, last = whole, 0.0, inputs, 0
             for degree in reversed(range(math.isqrt(whole + 1) - 1)):
                 fewer = _shortened(inputs, field, (degree + 1) ** 2 - 1)
                 worse = probe.psnr_loss(state, lambda _, fewer=fewer: fewer, inputs)

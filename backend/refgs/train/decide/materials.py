@@ -6,7 +6,7 @@ from torch import Tensor
 from refgs.formats.needs import Found
 from refgs.model.surfels import Surfels
 from refgs.train import probe
-from refgs.train.decide.need import ASKED, MEGA, Decision, Moment, Need, megabytes
+from refgs.train.decide.need import ASKED, MEGA, Decision, Given, Moment, Need, megabytes
 from refgs.train.material import metals
 from refgs.train.material.changes import change_seen
 from refgs.train.material.observe import observe_changes
@@ -33,7 +33,7 @@ class Specular(Need):
         mirrors = state.settings.render.reflection == "microfacet"
         return mirrors and (moment == "specular" or self.asked(state) == "off")
 
-    def measure(self, state: State, done: int = 0) -> Decision:
+    def measure(self, state: State, given: Given) -> Decision:
         if self.asked(state) == "off":
             return Decision(False, ASKED)
         explained = probe.specular_explains(state)
@@ -95,8 +95,8 @@ class Constants(Need):
     threshold, reason = 1 / 255, "no 8-bit texture shows a smaller spread"
     moments = ("asset",)
 
-    def measure(self, state: State, common: dict[str, tuple[float, float]], count: int) -> Decision | None:
-        if not common:
+    def measure(self, state: State, given: Given) -> Decision | None:
+        if not (common := given.common):
             return None
 
         def same(inputs: RenderInputs) -> RenderInputs:
@@ -105,7 +105,7 @@ class Constants(Need):
             return inputs._replace(surfels=surfels._replace(**values))
 
         why = "; ".join(f"{name} is {value:.3f}, within {spread:.4f}" for name, (value, spread) in common.items())
-        figures = {"megabytes": 4 * len(common) * count / MEGA, "decibels": probe.psnr_loss(state, same).whole}
+        figures = {"megabytes": 4 * len(common) * given.kept / MEGA, "decibels": probe.psnr_loss(state, same).whole}
         return Decision(False, why, figures, len(common))
 
     @torch.no_grad()

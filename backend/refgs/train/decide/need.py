@@ -1,8 +1,9 @@
 """Define `Need`, an optional part of the training such as inter-reflection, and `Decision`, whether a scene needs it."""
 
+import math
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 from refgs.formats.needs import Found
 from refgs.train.state import State
@@ -33,6 +34,20 @@ class Decision(NamedTuple):
     )  # done when it is decided; its result is in checkpoints, or made by each start
 
 
+class Given(NamedTuple):
+    """Hold what the caller of `Need.measure` has measured.
+
+    - `done`: how many iterations are done.
+    - `hidden`: the fraction of the object's pixels that mirror the object.
+    - `common`: of metallic and roughness, those that have about the same value for all of `kept` surfels: the value and the range's width.
+    """
+
+    done: int = 0
+    hidden: float = 0.0
+    common: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    kept: int = 0
+
+
 class Need:
     """Describe an optional part of the training, such as inter-reflection, and how to decide whether a scene needs it.
 
@@ -41,7 +56,7 @@ class Need:
 
     name: ClassVar[str]  # also in the settings' `needs`
     what: ClassVar[str]  # words for the artist
-    threshold: ClassVar[float | None] = None
+    threshold: ClassVar[float] = math.nan
     reason: ClassVar[str] = ""  # for the threshold
     moments: ClassVar[tuple[Moment, ...]]
     follows: ClassVar[str] = ""  # a need after whose decision this one is asked, too, and with which it is taken back
@@ -53,11 +68,8 @@ class Need:
         """
         return True
 
-    def measure(self, state: State, *given: Any) -> Decision | None:
-        """Decide whether the scene needs this optional part of the training. Returns None to make no decision.
-
-        `given` are values that the caller has measured, such as the fraction of pixels that mirror the object.
-        """
+    def measure(self, state: State, given: Given) -> Decision | None:
+        """Decide whether the scene needs this optional part of the training. Returns None to make no decision."""
         raise NotImplementedError
 
     def apply(self, state: State, found: Found) -> None:

@@ -13,7 +13,7 @@ from refgs.paths import write_text
 from refgs.train.decide.iterations import Initial, Iterations
 from refgs.train.decide.lighting import Degrees, Light, Reflections, share_hidden
 from refgs.train.decide.materials import Constants, Specular
-from refgs.train.decide.need import Decision, Moment, Need
+from refgs.train.decide.need import Decision, Given, Moment, Need
 from refgs.train.decide.photos import Outside, Views
 from refgs.train.decide.pictures import write_pictures
 from refgs.train.state import State
@@ -51,17 +51,17 @@ __all__ = [
 ]
 
 
-def evaluate(state: State, moment: Moment, *given: Any) -> list[str]:
+def evaluate(state: State, moment: Moment, given: Given = Given()) -> list[str]:  # noqa: B008  (it is frozen)
     """Decide about the optional parts of the training (needs) that are due at a `moment`, such as "start" or "mesh".
 
-    Returns the names of the needs decided. `given` are measured values, passed on to `Need.measure`.
+    Returns the names of the needs decided. `given` is passed on to `Need.measure`.
     """
     decided: list[str] = []
     for need in NEEDS:
         asked = moment in need.moments or need.follows in decided
         if not asked or need.name in state.needs or need.asked(state) == "on":
             continue
-        if need.due(state, moment) and (decision := need.measure(state, *given)):
+        if need.due(state, moment) and (decision := need.measure(state, given)):
             _record(state, need, decision)
             decided.append(need.name)
     return decided
@@ -69,7 +69,7 @@ def evaluate(state: State, moment: Moment, *given: Any) -> list[str]:
 
 def specular(state: State, step: Step) -> None:
     """Decide whether the scene needs specular shading, and what follows from that."""
-    evaluate(state, "specular", step.done)
+    evaluate(state, "specular", Given(step.done))
 
 
 def light(state: State, step: Step) -> None:
@@ -112,13 +112,14 @@ def _undo_following(state: State, decisions: dict[str, Found], why: str) -> None
 
 def reflections(state: State, step: Step) -> None:
     """Decide by a new mesh whether the scene needs inter-reflection. Once this is decided, only report how much mirrors itself."""
-    if not evaluate(state, "mesh", step.hidden):
-        state.announce("reflections", f"with {Reflections.what}: {share_hidden(step.hidden)}")
+    hidden = step.hidden or 0.0
+    if not evaluate(state, "mesh", Given(step.done, hidden)):
+        state.announce("reflections", f"with {Reflections.what}: {share_hidden(hidden)}")
 
 
 def _record(state: State, need: Need, decision: Decision) -> None:
     """Record a decision about an optional part of the training, and report it. Leave the part out if it is not needed."""
-    figures = {key: float(value) for key, value in decision.figures.items()}
+    figures: dict[str, Any] = {key: float(value) for key, value in decision.figures.items()}
     if decision.statistic is not None:
         threshold = need.threshold if decision.threshold is None else decision.threshold
         figures = {"statistic": float(decision.statistic), "threshold": float(threshold)} | figures

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from refgs.settings import SurfelSettings
-from refgs.train.photo import bounds
+from refgs.train.photo import crop_of
 from refgs.train.state import State, spread
 
 SIZE_VIEWS = 24  # that are looked at, at the most
@@ -30,8 +30,9 @@ def object_size(state: State) -> ObjectSize:
         return ObjectSize(0.0, 0.0)
     spans, areas, capture = [], [], state.capture
     for view in spread(state.views, SIZE_VIEWS):
-        rows, columns = bounds(view.alpha, 0)
-        span, area = max(rows.stop - rows.start, columns.stop - columns.start), np.count_nonzero(view.alpha > 127)
+        rows, columns = crop_of(view, 0)
+        span = max(rows.stop - rows.start, columns.stop - columns.start)
+        area = view.image[..., 0].size if view.alpha is None else np.count_nonzero(view.alpha > 127)
         if capture.box is not None:
             depth = view.camera.world_to_camera[2] @ [*capture.centre, 1.0]
             ball = 2 * capture.radius * view.camera.fx / max(depth, capture.radius)

@@ -7,8 +7,8 @@ import numpy as np
 from refgs.capture import LoadedView
 from refgs.compare.metrics import psnr
 from refgs.train import probe
-from refgs.train.decide.need import MEGA, Decision, Moment, Need
-from refgs.train.photo import MARGIN, bounds
+from refgs.train.decide.need import MEGA, Decision, Given, Moment, Need
+from refgs.train.photo import MARGIN, crop_of
 from refgs.train.state import State
 from refgs.train.timeline import WHOLE_EVERY, Step
 
@@ -22,7 +22,7 @@ class Views(Need):
     threshold, reason = 1, "each duplicate costs as much as a photo that adds something"
     moments = ("photos",)
 
-    def measure(self, state: State) -> Decision | None:
+    def measure(self, state: State, given: Given) -> Decision | None:
         found = duplicate_views(state.views, state.capture.radius)
         if not found:
             return None
@@ -46,8 +46,8 @@ class Outside(Need):
     def due(self, state: State, moment: Moment) -> bool:
         return state.from_hull and state.settings.loss.alpha > 0
 
-    def measure(self, state: State) -> Decision | None:
-        crops = [bounds(view.alpha, MARGIN) for view in state.views]
+    def measure(self, state: State, given: Given) -> Decision | None:
+        crops = [crop_of(view, MARGIN) for view in state.views]
         within = sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in crops)
         part = 1 - within / sum(photo.image[..., 0].numel() for photo in state.photos)
         if self.asked(state) == "auto" and part < self.threshold:

@@ -77,7 +77,7 @@ def _reflections(state: State, found: Found, views: list[int]) -> Iterator[tuple
         return
     ways = probe.mirroring_itself(inputs, _mean_radiance(state, inputs, views)), inputs._replace(occluder=None)
     for view in views:
-        yield tuple(probe.picture(state, view, way).color for way in ways)
+        yield probe.picture(state, view, ways[0]).color, probe.picture(state, view, ways[1]).color
 
 
 def _mean_radiance(state: State, inputs: RenderInputs, views: list[int]) -> Tensor:
@@ -93,9 +93,9 @@ def _light(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tenso
     inputs = state.inputs()
     if found.needed or inputs.settings.reflection == "none":
         return
-    coarse = inputs._replace(environment=probe.pooled(inputs.environment, int(found.side)))
+    coarse = inputs._replace(environment=probe.pooled(inputs.light, int(found.side or 0)))
     for view in views:
-        yield tuple(probe.picture(state, view, way).color for way in (inputs, coarse))
+        yield probe.picture(state, view, inputs).color, probe.picture(state, view, coarse).color
 
 
 PAIRS: dict[str, Pair] = {"specular": _specular, "reflections": _reflections, "light": _light}

@@ -126,7 +126,7 @@ def ambiguities(state: State) -> dict[str, dict]:
 
 def _pictures(state: State, scene: Explanation, chosen: range) -> Iterator[Tensor]:
     """Render `scene` in the training views with the indices `chosen`. Yield pictures (H, W, 3)."""
-    light = Environment(scene[1].contiguous(), state.environment().reference)
+    light = Environment(scene[1].contiguous(), state.inputs().light.reference)
     inputs = RenderInputs(scene[0], light, state.settings.render, state.occluder)
     for view in chosen:
         yield state.picture(inputs, state.views[view].camera, exposure(state, view)).color.clamp(0, 1)

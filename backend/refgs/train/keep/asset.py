@@ -22,6 +22,7 @@ from refgs.render.volume import with_normals_last
 from refgs.run import OCCLUDER
 from refgs.run_folder import SPLATS, update_metrics
 from refgs.train.decide import needs
+from refgs.train.decide.need import Given
 from refgs.train.learn import poses
 from refgs.train.learn.exposures import exposure
 from refgs.train.learn.poses import Poses
@@ -90,7 +91,7 @@ def _constant_columns(state: State, surfels: Surfels, kept: Tensor) -> dict[str,
     if state.settings.render.reflection == "none" and state.method.lit:
         return {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
     common = needs.CONSTANTS.common(state, surfels, kept)
-    needs.evaluate(state, "asset", common, int(kept.sum()))
+    needs.evaluate(state, "asset", Given(state.iteration, common=common, kept=int(kept.sum())))
     return {name: value for name, (value, _) in common.items()}
 
 

@@ -60,12 +60,12 @@ class Measures:
         try:
             read = GroundTruth(folder, capture.to_capture) if folder.is_dir() else None
             truth = read or published_truth(capture, capture.to_capture)
-            self._test_views = [self._test_view(*pair, truth, capture.to_capture) for pair in chosen]
+            self._test_views = [self._test_view(view, loaded, truth, capture.to_capture) for view, loaded in chosen]
             if truth:
                 self._read_lights(truth, state.device)
         except InputError as error:
             state.report("warning", {"what": f"errors against the ground truth are not recorded: {error}"})
-            self._test_views = [self._test_view(*pair, None, None) for pair in chosen]
+            self._test_views = [self._test_view(view, loaded, None, None) for view, loaded in chosen]
 
     def _test_view(
         self, view: View, loaded: LoadedView, truth: GroundTruth | None, to_capture: np.ndarray | None
@@ -111,7 +111,7 @@ class Measures:
             found["albedo_psnr"] = metrics.aligned_psnr(rows.pop("albedo"))["psnr_aligned"]
         found = {name: float(np.mean(values)) for name, values in rows.items()} | found
         if self._panorama is not None:
-            light = self._method.light.to_linear(state.environment().panorama(ROWS))
+            light = self._method.light.to_linear(state.inputs().light.panorama(ROWS))
             found["light_log_rmse"] = metrics.environment_log_rmse(light, self._panorama)[0]
         if self._light is not None:
             found["relit_psnr"] = self._relit(state)

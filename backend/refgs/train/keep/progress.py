@@ -1,6 +1,7 @@
 """Average the loss over the last iterations, for the history and the progress that is reported."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,14 +16,14 @@ class Means(Part):
 
     name = "means"
 
-    def __init__(self) -> None:
+    def start(self, state: State) -> None:
         self.values: dict[str, Tensor] = {}
 
-    def tensors(self, state: State) -> dict[str, Tensor]:
-        return self.values
+    def facts(self, state: State) -> dict[str, Fact]:
+        return {**self.values}
 
-    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping[str, Tensor]) -> None:
-        self.values = dict(tensors)
+    def restore(self, state: State, facts: Mapping[str, Any]) -> None:
+        self.values = dict(facts)
 
     def add(self, figures: Mapping[str, Tensor]) -> None:
         """Add the figures of an iteration. A graphics card need not have computed them yet."""

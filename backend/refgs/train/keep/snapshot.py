@@ -9,21 +9,26 @@ from refgs.formats.checkpoint import Facts
 from refgs.formats.validate import validated
 from refgs.train.decide import needs
 from refgs.train.keep import checkpoint
+from refgs.train.part import Fact
 from refgs.train.state import State
 
 
 def save(state: State) -> None:
     """Write a checkpoint into the run folder."""
     tensors = state.learned.save()
+    parts: dict[str, dict[str, Fact]] = {}
     for part in state.parts.values():
-        tensors |= {f"{part.name}.{name}": value for name, value in part.tensors(state).items()}
+        found = part.facts(state)
+        own = {f"{part.name}.{name}": value for name, value in found.items() if isinstance(value, torch.Tensor)}
+        tensors |= own
+        parts[part.name] = {name: value for name, value in found.items() if f"{part.name}.{name}" not in own}
     facts = {"seconds": state.seconds, "total": state.total, "initial": state.initial, "residual": state.residual}
     facts |= {"clock": state.clock.seconds, "spent": state.plan.spent, "processor_seconds": state.clock.processor}
     facts |= {
         "decided": state.decided,
         "needs": {name: found.model_dump(exclude_none=True) for name, found in state.needs.items()},
     }
-    facts["parts"] = {part.name: found for part in state.parts.values() if (found := part.facts(state))}
+    facts["parts"] = parts
     checkpoint.save(state.folder / "checkpoints", state.iteration, tensors, facts)
 
 
@@ -49,7 +54,7 @@ def restore(state: State, run: Path) -> None:
         for part in state.parts.values():
             prefix = f"{part.name}."
             own = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-            part.restore(state, facts.parts.get(part.name, {}), own)
+            part.restore(state, facts.parts.get(part.name, {}) | own)
     except KeyError:
         raise InputError(f"{run} was begun by another release of RefGS: train again into a new folder") from None
 

@@ -4,12 +4,13 @@ Small objects are trained on full photos from the start: of an object of 64 pixe
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 from refgs.camera import Camera
 from refgs.capture import LoadedView, reduced_views
 from refgs.run_folder import PHOTOS
-from refgs.train.part import Fact, Part
-from refgs.train.photo import MARGIN, Crop, Photo, bounds
+from refgs.train.part import Part
+from refgs.train.photo import MARGIN, Crop, Photo, crop_of
 from refgs.train.plan import FULL, Stage, iterations_time, stage_at
 from refgs.train.state import State
 from refgs.train.timeline import PHOTO_STAGES, POSES_KNOWN, Step
@@ -23,7 +24,7 @@ class Coarse(Part):
     `factor` is that by which the sides of `photos` are reduced, 1 for full photos. `crops` are the parts of `photos` that are trained on.
     """
 
-    name = "coarse"
+    name, saved = "coarse", ("factor",)
 
     def __init__(self) -> None:
         self.stages: tuple[Stage, ...] = FULL
@@ -31,11 +32,8 @@ class Coarse(Part):
         self.photos: list[Photo] = []
         self.crops: list[Crop] | None = None
 
-    def facts(self, state: State) -> dict[str, Fact]:
-        return {"factor": self.factor}
-
-    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping) -> None:
-        set_factor(state, int(facts.get("factor", 1)))
+    def restore(self, state: State, facts: Mapping[str, Any]) -> None:
+        set_factor(state, facts["factor"])
 
 
 def stages(pixels: float) -> tuple[Stage, ...]:
@@ -81,7 +79,7 @@ def set_factor(state: State, factor: int) -> None:
         with state.clock.part("reading"):
             views: list[LoadedView] = reduced_views(state.views, factor, state.folder / PHOTOS)
             coarse.photos = [Photo.of(view, state.device) for view in views]
-            coarse.crops = None if state.crops is None else [bounds(view.alpha, MARGIN) for view in views]
+            coarse.crops = None if state.crops is None else [crop_of(view, MARGIN) for view in views]
 
 
 def photo(state: State, view: int, whole: bool) -> Photo:

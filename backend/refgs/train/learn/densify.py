@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,12 +36,12 @@ class Densification(Part):
         """Restart the mean, after surfels have been replaced."""
         self.gradient = ScreenGradient(state.learned.count, state.device)
 
-    def tensors(self, state: State) -> dict[str, Tensor]:
+    def facts(self, state: State) -> dict[str, Fact]:
         return {"total": self.gradient.total, "views": self.gradient.views}
 
-    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, state: State, facts: Mapping[str, Any]) -> None:
         self.restart(state)
-        self.gradient.total, self.gradient.views = tensors["total"], tensors["views"]
+        self.gradient.total, self.gradient.views = facts["total"], facts["views"]
 
 
 def watch(state: State, step: Step, accepted: Tensor) -> None:

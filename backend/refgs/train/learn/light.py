@@ -4,7 +4,6 @@ A term of the loss pulls this mean towards grey, so that the light does not take
 """
 
 import math
-from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -21,7 +20,7 @@ from refgs.render.shade import mirror_directions
 from refgs.render.stack import stack
 from refgs.render.volume import discs
 from refgs.settings import RenderSettings, Settings
-from refgs.train.part import Fact, Part
+from refgs.train.part import Part
 from refgs.train.state import State
 from refgs.train.timeline import Step
 
@@ -36,16 +35,8 @@ MIRROR_SIDE = 16  # texels along a side of the cubemap that says which direction
 class MirroredLight(Part):
     """Remember which part of the light the object mirrors towards the cameras: the `weight` of each texel in the light's mean."""
 
-    name = "light"
-
-    def __init__(self) -> None:
-        self.weight: Tensor | None = None
-
-    def tensors(self, state: State) -> dict[str, Tensor]:
-        return {} if self.weight is None else {"weight": self.weight}
-
-    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping[str, Tensor]) -> None:
-        self.weight = tensors.get("weight")
+    name, saved = "light", ("weight",)
+    weight: Tensor | None = None
 
 
 def start_value(state: State) -> float:

@@ -9,17 +9,17 @@ also move where a mirror's image, which is not at rest on the mirror, is not exp
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from refgs.camera import Camera
 from refgs.capture import Capture
 from refgs.capture.matches import match_neighbours, pixels_apart
 from refgs.render.align import REDUCTIONS, pose_step, posed
 from refgs.train.learn import coarse
-from refgs.train.part import Fact, Part
+from refgs.train.part import Part
 from refgs.train.state import State
 from refgs.train.timeline import POSES_FROM, POSES_KNOWN, Step
 
@@ -36,12 +36,9 @@ class Poses(Part):
     given ones. `judged` tells whether `judge` has compared both.
     """
 
-    name = "poses"
-
-    def __init__(self) -> None:
-        self.given: list[Camera] = []
-        self.values: Tensor | None = None
-        self.judged = False
+    name, saved = "poses", ("judged", "values")
+    values: Tensor | None = None
+    judged = False
 
     def start(self, state: State) -> None:
         """Give every view a pose, zero, if the setting `cameras.poses` is "on", or "auto" and features contradict the given poses."""
@@ -55,16 +52,9 @@ class Poses(Part):
         if wanted == "on":
             self.values = torch.zeros(len(state.views), 6)
 
-    def facts(self, state: State) -> dict[str, Fact]:
-        return {"judged": self.judged}
-
-    def tensors(self, state: State) -> dict[str, Tensor]:
-        return {} if self.values is None else {"values": self.values}
-
-    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping[str, Tensor]) -> None:
-        self.judged = bool(facts.get("judged", True))
-        values = tensors.get("values")
-        self.put(state, None if values is None else values.cpu())
+    def restore(self, state: State, facts: Mapping[str, Any]) -> None:
+        self.judged = facts["judged"]
+        self.put(state, facts["values"].cpu() if "values" in facts else None)
 
     def put(self, state: State, values: Tensor | None) -> None:
         """Set the poses of all views, or None: then all cameras are the given ones."""
@@ -117,7 +107,7 @@ def judge(state: State, step: Step) -> None:
         [replace(view, camera=camera) for view, camera in zip(state.views, poses.given, strict=True)]
     )
     given, found = (pixels_apart(matches, cameras) for cameras in (poses.given, [view.camera for view in state.views]))
-    if found < BETTER * given:
+    if found is not None and given is not None and found < BETTER * given:
         what = f"the cameras' poses are refined: features are {found:.1f} pixels off, and were {given:.1f}"
     else:
         poses.put(state, None)

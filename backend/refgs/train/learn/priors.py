@@ -46,11 +46,11 @@ class Priors(Part):
     """
 
     name = "priors"
+    disparity = False
 
-    def __init__(self) -> None:
+    def start(self, state: State) -> None:
         self.normals: Maps = {}
         self.depth: Maps = {}
-        self.disparity = False
 
 
 def load(state: State) -> None:
@@ -91,7 +91,7 @@ def loss(state: State, step: Step) -> Tensor | None:
         terms.append(normals_loss(rendering, photo, *priors.normals[view]))
     if weight > 0 and view in priors.depth:
         terms.append(depth_loss(rendering, photo, *priors.depth[view], priors.disparity, state.capture.radius))
-    return weight * sum(terms) if terms else None
+    return weight * torch.stack(terms).sum() if terms else None
 
 
 def fade(progress: float) -> float:
@@ -144,7 +144,7 @@ def fitted(guessed: Tensor, depth: Tensor, counts: Tensor, disparity: bool, radi
     (H, W), and a scalar: 1, or 0 if the guess falls where depth rises. No gradients.
     """
     wanted = 1 / depth.clamp_min(1e-6 * radius) if disparity else depth
-    weight = counts
+    weight, found, slope = counts, depth, counts
     for _ in range(ROUNDS):
         total = weight.sum().clamp_min(1e-6)
         means = (weight * guessed).sum() / total, (weight * wanted).sum() / total
@@ -194,7 +194,7 @@ def _with_axes(state: State, normals: Maps) -> Maps:
             photo = state.photo(view)
             rendering = state.render(photo.camera)
             guessed = at_pixels(*normals[view], photo.camera).float() / CODE
-            chosen = _near_outline(photo.mask) & (rendering.alpha > SOLID) & (guessed.square().sum(dim=-1) > 0.5)
+            chosen = _near_outline(photo) & (rendering.alpha > SOLID) & (guessed.square().sum(dim=-1) > 0.5)
             rotation = torch.from_numpy(photo.camera.world_to_camera[:3, :3].copy()).to(guessed)
             seen = torch.nn.functional.normalize(rendering.normal[chosen], dim=-1) @ rotation.T
             yield seen, guessed[chosen], guessed[chosen] @ to_camera(view).T
@@ -221,10 +221,15 @@ def _with_axes(state: State, normals: Maps) -> Maps:
     return normals
 
 
-def _near_outline(mask: Tensor) -> Tensor:
-    """Tell which pixels (H, W) of a mask lie just inside its outline: there the visual hull has the surface's normals, over a bowl, too."""
-    shown = (mask > 127).float()[None]
-    reach = max(1, max(mask.shape) // OUTLINE)
+def _near_outline(photo: Photo) -> Tensor:
+    """Tell which pixels (H, W) of a photo's mask lie just inside its outline: there the visual hull has the surface's normals.
+
+    This holds over a bowl, too.
+    """
+    if photo.mask is None:
+        return torch.zeros(photo.image.shape[:2], dtype=torch.bool, device=photo.image.device)
+    shown = (photo.mask > 127).float()[None]
+    reach = max(1, max(photo.mask.shape) // OUTLINE)
     deep = -torch.nn.functional.max_pool2d(-shown, 2 * reach + 1, stride=1, padding=reach)
     return (shown > deep)[0]
 

@@ -1,10 +1,10 @@
 """Trace inter-reflection on a mesh made from the surfels."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from refgs.errors import InputError
 from refgs.formats.mesh import Mesh
@@ -29,16 +29,16 @@ class TracedMesh(Part):
 
     name = "occluder"
 
-    def tensors(self, state: State) -> dict[str, Tensor]:
+    def facts(self, state: State) -> dict[str, Fact]:
         if state.occluder is None:
             return {}
         mesh = state.occluder.mesh
         return {"vertices": torch.from_numpy(mesh.vertices), "faces": torch.from_numpy(mesh.faces.astype(np.int32))}
 
-    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, state: State, facts: Mapping[str, Any]) -> None:
         state.occluder = None
-        if tensors and not why_not_traced(state):
-            state.occluder = Occluder(Mesh(tensors["vertices"].numpy(force=True), tensors["faces"].numpy(force=True)))
+        if facts and not why_not_traced(state):
+            state.occluder = Occluder(Mesh(*(facts[name].numpy(force=True) for name in ("vertices", "faces"))))
 
 
 @torch.no_grad()
@@ -63,12 +63,12 @@ def make_mesh(state: State, step: Step) -> None:
         for camera in cameras[::3]:
             seen = state.picture(inputs, camera)
             opaque = seen.alpha > SOLID
-            hidden += float((1 - seen.visibility)[opaque].sum())
+            hidden += float((1 - seen.visibility)[opaque].sum()) if seen.visibility is not None else 0.0
             solid += float(opaque.sum())
         step.hidden = hidden / solid
         if "indirect_dc" not in state.learned.moments:
             # Start from the light that the surfels mirrored until now, so that the picture changes little.
-            start, rest = inputs.environment.harmonics, state.learned["indirect_rest"]
+            start, rest = inputs.light.harmonics, state.learned["indirect_rest"]
             state.learned["indirect_dc"][:], rest[:] = start[:1], start[1 : 1 + rest.shape[1]]
 
 
@@ -78,5 +78,5 @@ def trace_received(state: State, step: Step) -> None:
     if state.occluder is None or "received" not in state.learned:
         return
     traced = Surfels(*(value.cpu() for value in with_normals_last(state.surfels())))
-    light = Environment(state.environment().radiance.cpu())  # in the world's frame: in the camera's nothing is traced
+    light = Environment(state.inputs().light.radiance.cpu())  # in the world's frame: in the camera's nothing is traced
     state.learned["received"][:] = received(traced, state.occluder, light)

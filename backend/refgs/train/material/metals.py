@@ -7,17 +7,14 @@ Where nearly all of the surface shines as coloured metals do, metallic no longer
 again, since roughness, light and base colour explain rough metal and paint about as well.
 """
 
-from collections.abc import Mapping
-
 import torch
 
-from refgs.formats.hints import KINDS
 from refgs.model.surfels import raw_metallic
 from refgs.train.material import mirrored, same_material
 from refgs.train.material.changes import falls_as_metal, shines_as_metal
 from refgs.train.material.changing_light import explained
 from refgs.train.material.observe import Kinds, observe_changes
-from refgs.train.part import Fact, Part
+from refgs.train.part import Part
 from refgs.train.state import State
 from refgs.train.timeline import Step, metals_decidable
 
@@ -29,28 +26,20 @@ TELLING = (
 )
 TOLD = 0.005  # part of the surface, above which a change is announced
 DOUBTFUL = 0.5  # doubt from which on photos do not tell
-HELD = Kinds(metal=0.98, paint=0.002)  # metallic that stays
+HELD = Kinds(metal=0.98, paint=0.002)  # metallic that stays, in the order of `hints.KINDS`
 
 
 class Metals(Part):
     """Remember whether metals were `found`, by photos or by hints."""
 
-    name = "metals"
-
-    def __init__(self) -> None:
-        self.found = False
+    name, saved = "metals", ("found",)
+    found = False
 
     def start(self, state: State) -> None:
         self.found = False
         if "metallic" in state.learned:
             held = torch.zeros(state.learned.count, dtype=torch.bool, device=state.device)
             state.learned.learn("held", held)
-
-    def facts(self, state: State) -> dict[str, Fact]:
-        return {"found": self.found}
-
-    def restore(self, state: State, facts: Mapping[str, Fact], tensors: Mapping[str, torch.Tensor]) -> None:
-        self.found = bool(facts.get("found", True))
 
 
 def find_metals(state: State, step: Step) -> None:
@@ -71,7 +60,7 @@ def find_metals(state: State, step: Step) -> None:
     observations, metallic = observe_changes(state), state.learned["metallic"]
     positions, weight = state.learned["position"].detach(), observations.pixels.sum(dim=1) * state.wanted()
     coloured, faint, tells = shines_as_metal(observations, positions)
-    metal = coloured | falls_as_metal(observations, positions, float(state.environment().radiance.detach().mean()))
+    metal = coloured | falls_as_metal(observations, positions, float(state.inputs().light.radiance.detach().mean()))
     told, shown, shown_faintly = explained(observations, positions, state.capture.radius, metal, coloured, faint)
     refuted = torch.zeros_like(metal)
     if told.by_changes:
@@ -151,8 +140,8 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
 @torch.no_grad()
 def hold_as(state: State, kinds: torch.Tensor) -> None:
     """Hold the metallic of surfels from now on (see `hold`). `kinds` (N,) has their index in `hints.KINDS`, −1 for those that learn."""
-    for number, kind in enumerate(KINDS):
-        state.learned["metallic"][kinds == number] = raw_metallic(getattr(HELD, kind))
+    for number in range(len(HELD)):
+        state.learned["metallic"][kinds == number] = raw_metallic(HELD[number])
     state.learned["held"].copy_(kinds >= 0)
     state.learned.forget("metallic", kinds >= 0)
     state.part(Metals).found = True

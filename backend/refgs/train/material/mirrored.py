@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from refgs.formats.mesh import Mesh
 from refgs.geometry.mesh import smooth_normals
 from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
@@ -54,8 +55,8 @@ def fit_both(state: State) -> tuple[Surfels, Seen, Fit]:
     inputs = inputs._replace(surfels=Surfels(*(value.detach() for value in inputs.surfels)))
     seen = observe_mirrored(state, inputs, photos)
     surfels = Surfels(*(value.cpu() for value in inputs.surfels))
-    turns = [torch.from_numpy(inputs.environment.turn(state.photo(view).camera)).float() for view in photos]
-    light = Environment(inputs.environment.radiance.cpu())
+    turns = [torch.from_numpy(inputs.light.turn(state.photo(view).camera)).float() for view in photos]
+    light = Environment(inputs.light.radiance.cpu())
     return surfels, seen, _fit(seen, _mirrored(state, surfels, seen, light, turns), surfels.positions)
 
 
@@ -63,27 +64,28 @@ def _mirrored(
     state: State, surfels: Surfels, seen: Seen, light: Environment, turns: list[Tensor]
 ) -> Iterator[list[Tensor]]:
     """Yield for each photo what the surfels mirror there, as one tensor (N, 3) for each of ROUGHNESSES."""
-    levels, occluder, there = cubemap.in_texel_order(light.levels, light.sides), state.occluder, None
-    if occluder is not None:
-        mesh = occluder.mesh
-        weights = blend(
-            surfels, seen.outward.double().numpy(), mesh.vertices, smooth_normals(mesh.vertices, mesh.faces)
-        )
-        there = torch.from_numpy(weights @ seen.mean.numpy())
+    levels, occluder = cubemap.in_texel_order(light.levels, light.sides), state.occluder
+    there = torch.zeros(0, 3) if occluder is None else _at_vertices(surfels, seen, occluder.mesh)
     points = surfels.positions.double().numpy()
     for view, turn in enumerate(turns):
         normal = seen.normal[:, view]
         direction = mirror(-seen.towards[:, view], normal)
         levels_of = (torch.full((len(normal),), float(prefilter.level_of(roughness))) for roughness in ROUGHNESSES)
         shown = [cubemap.sample(levels, light.sides, direction @ turn.T, level) for level in levels_of]
-        if there is not None:
+        if occluder is not None:
             face, inside = occluder.meet(points, normal.double().numpy(), direction.double().numpy())
             met = face >= 0
-            corners = there[torch.from_numpy(mesh.faces[face[met]]).long()]
+            corners = there[torch.from_numpy(occluder.mesh.faces[face[met]]).long()]
             radiance = (corners * torch.from_numpy(inside[met])[..., None]).sum(dim=1)
             for each in shown:
                 each[torch.from_numpy(met)] = radiance
         yield [each.clamp_max(BRIGHTEST) for each in shown]
+
+
+def _at_vertices(surfels: Surfels, seen: Seen, mesh: Mesh) -> Tensor:
+    """Return the mean radiance (M, 3) that photos show at the vertices of a mesh."""
+    normals = smooth_normals(mesh.vertices, mesh.faces)
+    return torch.from_numpy(blend(surfels, seen.outward.double().numpy(), mesh.vertices, normals) @ seen.mean.numpy())
 
 
 def _fit(seen: Seen, mirrored: Iterable[list[Tensor]], positions: Tensor) -> Fit:

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 from torch import Tensor
 
 from refgs.color import srgb_decode
