@@ -36,11 +36,11 @@ def displayed(run: Run, progress: Callable[[int, int], None] = lambda done, tota
     constant = torch.from_numpy(splats.sh[:, :1].copy()).requires_grad_()
     rest = torch.zeros(len(splats), (DEGREE + 1) ** 2 - 1, 3, requires_grad=True)
     adam = Adam([{"params": [constant], "lr": RATE}, {"params": [rest], "lr": RATE_OF_REST}])
-    order = np.random.default_rng(0)
+    order, queue = np.random.default_rng(0), []
     for iteration in range(ITERATIONS):
-        if iteration % len(cameras) == 0:
-            queue = order.permutation(len(cameras))
-        number = int(queue[iteration % len(cameras)])
+        if not queue:
+            queue = order.permutation(len(cameras)).tolist()
+        number = queue.pop(0)
         if number not in shown:
             shown[number] = run.render(cameras[number]).color.detach().clamp(0, 1)
         loss = (_by_direction(run, constant, rest, cameras[number]) - shown[number]).square().mean()

@@ -5,14 +5,14 @@ import numpy as np
 import trimesh
 
 from refgs.errors import InputError
-from refgs.formats.mesh import Mesh
+from refgs.formats.mesh import Mesh, SmoothMesh
 
 KEEP = 0.01  # of the largest part's area: smaller parts are crumbs. the largest crumb of four real captures has 0.006
 HOLE = 32  # edges around a small hole, about seven voxels across
 FRAY = 2  # rings of faces, from a border inwards: what is nowhere farther from the border frays out
 
 
-def clean(mesh: Mesh, triangles: int) -> Mesh:
+def clean(mesh: Mesh, triangles: int) -> SmoothMesh:
     """Clean up a mesh, simplify it to about `triangles` faces if it has more, and compute smooth normals.
 
     - Crumbs are removed: connected parts with less than KEEP times the largest part's area.
@@ -43,7 +43,7 @@ def clean(mesh: Mesh, triangles: int) -> Mesh:
         for aggressiveness in (3, 5, 7):
             vertices, faces = fast_simplification.simplify(
                 work.vertices, work.faces, target_count=triangles, agg=aggressiveness
-            )
+            )[:2]
             if len(faces) <= triangles:
                 break
         work = trimesh.Trimesh(vertices, faces, process=False)
@@ -53,7 +53,7 @@ def clean(mesh: Mesh, triangles: int) -> Mesh:
     used, faces = np.unique(work.faces, return_inverse=True)
     vertices = np.asarray(work.vertices)[used]
     faces = faces.reshape(-1, 3)
-    return Mesh(vertices, faces, smooth_normals(vertices, faces))
+    return SmoothMesh(vertices, faces, smooth_normals(vertices, faces))
 
 
 def _large(mesh: trimesh.Trimesh) -> np.ndarray:
