@@ -76,25 +76,25 @@ class Clock:
         """Call function(*arguments, **words), count its time for the part `name`, and return its result."""
         if self._within:
             return function(*arguments, **words)
-        self._within, begun = True, self._now()
+        self._within, begun = True, _event() if self._on_card else time.perf_counter()
         try:
             return function(*arguments, **words)
         finally:
-            self._within, ended = False, self._now()
-            if self._on_card:
-                self._events.append((name, begun, ended))
+            self._within = False
+            if isinstance(begun, torch.cuda.Event):
+                self._events.append((name, begun, _event()))
             else:
-                self._add(name, ended - begun)
-
-    def _now(self):
-        if not self._on_card:
-            return time.perf_counter()
-        event = torch.cuda.Event(enable_timing=True)
-        event.record()
-        return event
+                self._add(name, time.perf_counter() - begun)
 
     def _add(self, name: str, seconds: float) -> None:
         self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+
+
+def _event() -> torch.cuda.Event:
+    """Record an event on a card, which tells the time when the card comes to it."""
+    event = torch.cuda.Event(enable_timing=True)
+    event.record()
+    return event
 
 
 def timed(name: str) -> Callable:

@@ -1,12 +1,20 @@
 """Apply the sRGB transfer curve to numpy arrays and torch tensors."""
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Values = TypeVar("Values", np.ndarray, "Tensor")
 
 _LINEAR_END = 0.0031308  # linear radiance where the straight piece of the curve ends
 _ENCODED_END = 0.04045  # the same point, encoded
 
 
-def srgb_encode(linear):
+def srgb_encode(linear: Values) -> Values:
     """Encode linear Rec.709 radiance as sRGB (IEC 61966-2-1), element by element.
 
     Values are not clamped: the straight piece extends below zero and the power law above one. So values and gradients are
@@ -18,14 +26,14 @@ def srgb_encode(linear):
     return where(linear <= _LINEAR_END, 12.92 * linear, curve)
 
 
-def srgb_decode(encoded):
+def srgb_decode(encoded: Values) -> Values:
     """Decode sRGB values (0..1 in a photo) to linear Rec.709 radiance: the inverse of `srgb_encode`."""
     where, maximum = _functions(encoded)
     curve = ((maximum(encoded, _ENCODED_END) + 0.055) / 1.055) ** 2.4
     return where(encoded <= _ENCODED_END, encoded / 12.92, curve)
 
 
-def _functions(values):
+def _functions(values: Values) -> tuple[Callable[..., Any], Callable[..., Any]]:
     if isinstance(values, np.ndarray | np.number | float | int):
         return np.where, np.maximum
     import torch  # here, because most users of numpy arrays never need torch

@@ -89,7 +89,7 @@ def _child(root: Path, what: str, module: str, *arguments: object) -> None:
             subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
             commands.progress_bar(what, 1) as bar,
         ):
-            for line in process.stdout:
+            for line in process.stdout or ():
                 if line.startswith("{"):
                     event = json.loads(line)
                     if event["event"] == "progress":
@@ -124,7 +124,7 @@ def _compare(folder: Path, truth: Path, previews: Path) -> None:
 
 def _record(folder: Path, seconds: float) -> None:
     """Write the demo's run time and peak memory to metrics.json."""
-    facts, largest = {"seconds": seconds}, [train_job.peak_memory(children) for children in (False, True)]
-    if None not in largest:
+    facts, known = {"seconds": seconds}, (train_job.peak_memory(children) for children in (False, True))
+    if largest := [most for most in known if most is not None]:
         facts["peak_memory_bytes"] = max(largest)
     update_metrics(folder, facts)

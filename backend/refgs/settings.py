@@ -5,7 +5,7 @@ import reprlib
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, cast
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
@@ -60,7 +60,8 @@ class ImageSettings(_Section):
     )
 
 
-class RenderSettings(_Section):
+# Said as type checkers read it: `method_of` caches by these settings, so they must be known to be hashable.
+class RenderSettings(BaseModel, extra="forbid", frozen=True):
     """Shading."""
 
     shading: Literal["deferred", "splat", "sh"] = Field(description="deferred: materials are blended, then shaded")
@@ -367,14 +368,14 @@ def validate(tables: dict[str, Any], source: str) -> Settings:
         if first["type"] == "missing":
             raise InputError(f'{source}: {key} is missing; add it, or start the file with base = "standard"') from None
         if first["type"] == "value_error":
-            raise InputError(f"{source}: {key}: {first['ctx']['error']}") from None
+            raise InputError(f"{source}: {key}: {first.get('ctx', {})['error']}") from None
         raise InputError(f"{source}: {key} = {reprlib.repr(first['input'])}: {first['msg'].lower()}") from None
 
 
 def _known_keys(location: tuple) -> list[str]:
-    model = Settings
+    model: type[BaseModel] = Settings
     for part in location:
-        model = model.model_fields[part].annotation
+        model = cast(type[BaseModel], model.model_fields[part].annotation)  # only sections have keys below them
     return list(model.model_fields)
 
 

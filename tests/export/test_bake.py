@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from refgs.export.bake import bake
 from refgs.export.occlusion import openness
 from refgs.export.unwrap import unwrap
-from refgs.formats.mesh import Mesh
+from refgs.formats.mesh import SmoothMesh
 from refgs.formats.splats import Splats
 from refgs.formats.textures import write_textures
 from tests.makers.painted_ball import ball, look_up, on_surface, paint, shaded_normals, sphere_of_splats
@@ -151,7 +151,7 @@ def test_what_stands_in_the_open_and_what_does_not():
     ground = trimesh.creation.box((8, 8, 0.1)).subdivide().subdivide().subdivide()
     wall = trimesh.creation.box((0.1, 8, 8)).apply_translation((-4, 0, 4))
     corner = trimesh.util.concatenate([ground, wall])
-    mesh = Mesh(np.array(corner.vertices), np.array(corner.faces), np.array(corner.vertex_normals))
+    mesh = SmoothMesh(np.array(corner.vertices), np.array(corner.faces), np.array(corner.vertex_normals))
     free = openness(mesh)
     x, y, z = mesh.vertices.T
     top = (z > 0) & (z < 0.1) & (np.abs(y) < 1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from refgs.export.unwrap import PART, layout, unwrap
-from refgs.formats.mesh import Mesh
+from refgs.formats.mesh import SmoothMesh, UnwrappedMesh
 from refgs.geometry.mesh import smooth_normals
 from tests.makers.painted_ball import ball
 
@@ -14,7 +14,7 @@ def bumpy():
     """Make a wavy sphere. It has so many triangles that the unwrapping splits it into several parts."""
     sphere = ball(4)
     vertices = sphere.vertices * (1 + 0.15 * np.sin(5 * sphere.vertices).prod(axis=1, keepdims=True))
-    return Mesh(vertices, sphere.faces, smooth_normals(vertices, sphere.faces))
+    return SmoothMesh(vertices, sphere.faces, smooth_normals(vertices, sphere.faces))
 
 
 @pytest.fixture(scope="module")
@@ -50,5 +50,5 @@ def test_texels_are_even_and_angles_kept(unwrapped):
 
 
 def test_stretch_is_told(unwrapped):
-    one_way = Mesh(unwrapped.vertices, unwrapped.faces, unwrapped.normals, unwrapped.uv * [1, 0.5])
+    one_way = UnwrappedMesh(unwrapped.vertices, unwrapped.faces, unwrapped.normals, unwrapped.uv * [1, 0.5])
     assert layout(one_way).bend > 10 and layout(one_way).used == pytest.approx(layout(unwrapped).used / 2)

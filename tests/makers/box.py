@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from refgs.export.unwrap import unwrap
-from refgs.formats.mesh import Mesh
+from refgs.formats.mesh import SmoothMesh
 from refgs.formats.textures import Textures
 from refgs.geometry.mesh import smooth_normals
 
@@ -15,7 +15,7 @@ def textured_box():
     """Make a box of 2 × 4 × 6 units that stands on the ground, and its textures. Base colour is a ramp; the others are constant."""
     box = trimesh.creation.box((2, 4, 6)).subdivide()
     vertices = np.array(box.vertices) + np.array([0, 0, 3])
-    mesh = unwrap(Mesh(vertices, np.array(box.faces), smooth_normals(vertices, box.faces)))
+    mesh = unwrap(SmoothMesh(vertices, np.array(box.faces), smooth_normals(vertices, box.faces)))
 
     def full(*value):
         return np.full((SIZE, SIZE, *([len(value)] if len(value) > 1 else [])), value, np.float32)

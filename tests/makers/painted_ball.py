@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from refgs.formats.mesh import Mesh
+from refgs.formats.mesh import SmoothMesh, UnwrappedMesh
 from refgs.formats.splats import Splats
 from refgs.formats.tangents import vertex_tangents
 from refgs.geometry.mesh import smooth_normals
@@ -41,13 +41,13 @@ def sphere_of_splats(count: int = 4000, radius: float = 1.0, outward: float = 1.
     )
 
 
-def ball(level: int = 3, radius: float = 1.0) -> Mesh:
+def ball(level: int = 3, radius: float = 1.0) -> SmoothMesh:
     """Make a triangle mesh of a sphere, with smooth normals."""
     sphere = trimesh.creation.icosphere(level, radius)
-    return Mesh(np.array(sphere.vertices), np.array(sphere.faces), smooth_normals(sphere.vertices, sphere.faces))
+    return SmoothMesh(np.array(sphere.vertices), np.array(sphere.faces), smooth_normals(sphere.vertices, sphere.faces))
 
 
-def on_surface(mesh: Mesh, count: int = 3000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def on_surface(mesh: UnwrappedMesh, count: int = 3000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Draw random points of a mesh. Return the vertex indices of their faces (P, 3), their barycentric weights (P, 3) and uv (P, 2)."""
     rng = np.random.default_rng(2)
     faces = mesh.faces[rng.integers(len(mesh.faces), size=count)]
@@ -69,7 +69,7 @@ def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return above * (1 - t) + below * t
 
 
-def shaded_normals(mesh: Mesh, normal_map: np.ndarray, faces, weights, uv) -> np.ndarray:
+def shaded_normals(mesh: UnwrappedMesh, normal_map: np.ndarray, faces, weights, uv) -> np.ndarray:
     """Compute the normals (P, 3) that a renderer gets from a normal map. They are not normalised.
 
     `faces`, `weights` and `uv` describe points of the mesh, as `on_surface` returns them.

@@ -223,6 +223,7 @@ class _Back:
 def _get(reference: Any) -> Any:
     """Wait for a value. Raises what made it fail, and TryAgain if the machine that has it does not answer."""
     import ray
+    import ray.exceptions
 
     try:
         return ray.get(reference)

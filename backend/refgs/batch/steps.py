@@ -136,9 +136,8 @@ def _call(step: Step, cores: int, log) -> tuple[int, str]:
         while process.poll() is None:
             time.sleep(0.1)  # and not `wait`: Ray interrupts Python code alone
     finally:
-        process.stdin.close()
         try:
-            process.wait(PATIENCE)
+            process.communicate(timeout=PATIENCE)  # closes its input
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

@@ -11,7 +11,7 @@ import numpy as np
 from refgs.capture.box import Box
 from refgs.capture.cached import load_views, reduced_views, release_memory, remove_cached
 from refgs.capture.cameras import read_cameras, read_run_cameras, write_cameras
-from refgs.capture.colmap import find_model, masks_root, read_colmap
+from refgs.capture.colmap import capture_root, find_model, read_colmap
 from refgs.capture.files import find_photos
 from refgs.capture.images import LoadedView, load_view
 from refgs.capture.nerf_blender import published_normals, read_nerf_blender
@@ -96,7 +96,7 @@ def read_files(folder: Path) -> CaptureFiles:
     views = _hold_out(views)
     _check_cameras(folder, views)
     views = _unique_names(views)
-    views = with_priors(views, masks_root(find_model(folder)[0]) if layout == "colmap" else folder)
+    views = with_priors(views, capture_root(folder, layout))
     return CaptureFiles(folder, layout, views, points, colors, [*warnings, *shared])
 
 
@@ -165,8 +165,8 @@ def _read(folder: Path, layout: str) -> tuple[list[View], np.ndarray | None, np.
             return views, None, None, warnings
         case "nerfstudio":
             return read_nerfstudio(folder)
-        case "colmap":
-            return *read_colmap(*find_model(folder)), []
+        case "colmap" if (model := find_model(folder)) is not None:
+            return *read_colmap(*model), []
     views, warnings = read_nero(folder)
     return views, None, None, warnings
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from refgs.camera import Camera
+from refgs.geometry.project import remap
 
 SIDE = 512  # texels
 REACH = 3.0  # half the texture's side, in radii of the region: low cameras see the object before a far part
@@ -25,8 +26,8 @@ DARK = 8.0  # added to 8-bit values before their logarithm, which noise would do
 BIN = np.array([12.75, 5.0, 5.0], np.float32)  # in 8-bit Lab, as the bins of the colours' histograms
 LEAST = np.array([2.0, 1.0, 1.0], np.float32)  # standard deviations that are taken for rounding
 PARTS = (
-    (0.97, np.float32([0, 0, 0])),
-    (0.03, np.float32([20, 2, 2])),
+    (0.97, np.zeros(3, np.float32)),
+    (0.03, np.array([20, 2, 2], np.float32)),
 )  # the plane as it was, and in a shadow or a highlight
 GRAZING = 0.15  # sine of the angle to the plane, below which a photo's pixels smear over the texture
 
@@ -108,9 +109,9 @@ class Backdrop:
         bare = np.zeros((SIDE * SIDE, len(images)), bool)  # photos in which nothing may hide a texel
         for index, (image, camera, hide) in enumerate(zip(images, cameras, hidden, strict=True)):
             at, valid = self._texels_in(camera)
-            warped = cv2.remap(_logarithm(image), at, None, cv2.INTER_LINEAR)
+            warped = remap(_logarithm(image), at)
             stack[valid.ravel(), :, index] = warped[valid]
-            free = valid & (cv2.remap(hide.astype(np.uint8), at, None, cv2.INTER_LINEAR, borderValue=1) == 0)
+            free = valid & (remap(hide.astype(np.uint8), at, outside=1) == 0)
             bare[:, index] = free.ravel()
         shown = stack[:, 0] < 255
         known = bare.sum(axis=1) >= SEEN
@@ -139,9 +140,9 @@ class Backdrop:
         The photo's exposure and noise are measured on the pixels that are not `hidden`.
         """
         texel, meets = self._pixels_on(camera)
-        known = meets & (cv2.remap(self.known.astype(np.uint8), texel, None, cv2.INTER_NEAREST) > 0)
-        color = cv2.remap(self.color, texel, None, cv2.INTER_LINEAR)
-        spread = cv2.remap(self.spread, texel, None, cv2.INTER_LINEAR).mean(axis=-1)
+        known = meets & (remap(self.known.astype(np.uint8), texel, cv2.INTER_NEAREST) > 0)
+        color = remap(self.color, texel)
+        spread = remap(self.spread, texel).mean(axis=-1)
         visible = known & ~hidden
         if visible.sum() < 200:
             return np.full(known.shape, np.nan, np.float32)
@@ -154,11 +155,11 @@ class Backdrop:
         for part, wide in PARTS:
             width = np.hypot(sigma, wide)
             result += part * np.exp(-0.5 * ((off / width) ** 2).sum(axis=-1)) * np.prod(BIN / (2.507 * width), axis=-1)
-        odds = cv2.remap(self.odds, texel, None, cv2.INTER_NEAREST, borderValue=np.nan)
+        odds = remap(self.odds, texel, cv2.INTER_NEAREST, outside=np.nan)
         return np.where(known, np.minimum(result, 1), np.where(meets, -odds, np.float32(np.nan)))
 
     def _pixels_on(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return the texel at each pixel as a map for cv2.remap (H, W, 2), and where there is one (H, W)."""
+        """Return the texel at each pixel as a map for `remap` (H, W, 2), and where there is one (H, W)."""
         column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         ray = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones_like(row)], axis=-1)
         ray = ray @ camera.world_to_camera[:3, :3]
@@ -171,7 +172,7 @@ class Backdrop:
         return texel, meets
 
     def _texels_in(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pixel of each texel as a map for cv2.remap (SIDE, SIDE, 2), and which texels the photo shows well enough."""
+        """Return the pixel of each texel as a map for `remap` (SIDE, SIDE, 2), and which texels the photo shows well enough."""
         column, row = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
         texel = np.stack([column, row, np.ones_like(row)], axis=-1)
         u, v, depth = np.moveaxis(texel @ (camera.projection @ self.to_world).T, -1, 0)
@@ -216,4 +217,4 @@ def _logarithm(image: np.ndarray) -> np.ndarray:
 
 def _lab(image: np.ndarray) -> np.ndarray:
     """Convert float RGB of 0..255 to Lab with all channels on 8-bit scales."""
-    return cv2.cvtColor(image / 255, cv2.COLOR_RGB2LAB) * np.float32([2.55, 1, 1])
+    return cv2.cvtColor(image / 255, cv2.COLOR_RGB2LAB) * np.array([2.55, 1, 1], np.float32)

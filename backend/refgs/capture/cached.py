@@ -65,8 +65,8 @@ def release_memory(views: list[LoadedView]) -> None:
         return
     for view in views:
         for array in (view.image, view.alpha):
-            if array is not None and isinstance(array.base, np.memmap):
-                array.base._mmap.madvise(mmap.MADV_DONTNEED)
+            if array is not None and isinstance(array.base, np.memmap) and isinstance(array.base.base, mmap.mmap):
+                array.base.base.madvise(mmap.MADV_DONTNEED)
 
 
 def remove_cached(folder: Path) -> None:

@@ -56,9 +56,8 @@ def write_cameras(
     frames = []
     for view in capture.views:
         camera = view.camera
-        known = exposures is not None and view.split == "train" and camera.name in exposures
-        factors = exposures[camera.name] if known else []
-        frame = {"exposure": factors if len(set(factors)) > 1 else factors[0]} if known else {}
+        factors = exposures.get(camera.name) if exposures is not None and view.split == "train" else None
+        frame = {} if factors is None else {"exposure": factors if len(set(factors)) > 1 else factors[0]}
         if refined and view.split == "train":
             frame["refined"] = True
         frames.append(
@@ -101,7 +100,7 @@ def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, l
         [frame_camera(frame, where(file, frame))[0] for frame in found.frames],
         [frame.split for frame in found.frames],
         _similarity(found.to_capture, file),
-        [frame.exposure if isinstance(frame.exposure, float) else list(frame.exposure) for frame in found.frames],
+        [list(frame.exposure) if isinstance(frame.exposure, tuple) else frame.exposure for frame in found.frames],
         any(frame.refined for frame in found.frames),
     )
 

@@ -97,7 +97,7 @@ def _sharpness(image: np.ndarray, inside: np.ndarray) -> float:
     Only pixels inside the mask and away from its edge count. The result does not depend on contrast. It is 0 for a uniform image.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    inside = cv2.erode(inside.astype(np.uint8), np.ones((7, 7), np.uint8), borderValue=0) > 0
+    inside = cv2.erode(inside.astype(np.uint8), np.ones((7, 7), np.uint8), borderValue=(0,)) > 0
     across, down = (cv2.Sobel(grey, cv2.CV_32F, *axis, scale=1 / 8)[inside] for axis in ((1, 0), (0, 1)))
     gradient = float((across**2 + down**2).sum())
     return float((cv2.Laplacian(grey, cv2.CV_32F)[inside] ** 2).sum()) / gradient if gradient > 0 else 0.0
@@ -126,12 +126,13 @@ def _decode_all(capture: Capture, thumbnails: Path | None) -> list[_Statistics]:
     for number, view in enumerate(capture.views):
         try:
             loaded = load_view(view, 512)
-            load_normals(view), load_depth(view)
+            load_normals(view)
+            load_depth(view)
         except InputError as error:
             broken.append(str(error))
             continue
         statistics.append(_Statistics(loaded))
-        if number in shown:
+        if thumbnails is not None and number in shown:
             _write_thumbnail(_thumbnail(thumbnails, number), loaded)
     if broken:
         count = f"{len(broken)} of {len(capture.views)} views cannot be read, the first: " if len(broken) > 1 else ""

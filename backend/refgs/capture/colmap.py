@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from refgs.camera import Camera
-from refgs.capture.files import Masks, find_image, photo_view, report_missing
+from refgs.capture.files import Masks, all_found, find_image, photo_view
 from refgs.capture.lens import Lens
 from refgs.capture.poses import world_to_camera
 from refgs.capture.transforms import camera_name
@@ -48,11 +48,10 @@ def read_colmap(photos: Path, model: Path) -> tuple[list[View], np.ndarray | Non
     images = sorted(read_images(images_file), key=lambda image: image.name)
     points, colors = read_points(points_file) if points_file.is_file() else (None, None)
 
-    found = [(image, find_image(photos / image.name, any_suffix=True)) for image in images]
-    report_missing(images_file, [f"{photos.name}/{i.name}" for i, path in found if path is None], len(found))
+    found = [(f"{photos.name}/{image.name}", find_image(photos / image.name, any_suffix=True)) for image in images]
     masks = Masks(masks_root(photos))
     views = []
-    for image, path in found:
+    for image, path in zip(images, all_found(images_file, found), strict=True):
         where = f"{images_file}, image {image.name}"
         if image.camera_id not in cameras:
             raise InputError(f"{where}: its camera {image.camera_id} is not in {cameras_file.name}. Export it again.")
@@ -66,12 +65,13 @@ def masks_root(photos: Path) -> Path:
     return photos if (photos / "sparse").is_dir() else photos.parent
 
 
+def capture_root(folder: Path, layout: str) -> Path:
+    """Return the folder in which the folder `masks` of a capture lies. `folder` and `layout` are the capture's."""
+    model = find_model(folder) if layout == "colmap" else None
+    return folder if model is None else masks_root(model[0])
+
+
 def _camera(image: Image, intrinsics: Intrinsics, where: str) -> tuple[Camera, Lens | None]:
-    if intrinsics.model not in SUPPORTED:
-        raise InputError(
-            f"{where}: COLMAP's camera model {intrinsics.model} is not supported, only {', '.join(SUPPORTED)}. "
-            "Undistort the photos with COLMAP's image_undistorter and use its output."
-        )
     radial, tangential = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0)
     match intrinsics.model, intrinsics.params:
         case "SIMPLE_PINHOLE", (f, cx, cy):
@@ -84,6 +84,11 @@ def _camera(image: Image, intrinsics: Intrinsics, where: str) -> tuple[Camera, L
             fx, fy, radial = f, f, (k1, k2, 0.0, 0.0)
         case "OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2):
             radial, tangential = (k1, k2, 0.0, 0.0), (p1, p2)
+        case _:
+            raise InputError(
+                f"{where}: COLMAP's camera model {intrinsics.model} is not supported, only {', '.join(SUPPORTED)}. "
+                "Undistort the photos with COLMAP's image_undistorter and use its output."
+            )
     if not np.isfinite(intrinsics.params).all() or min(fx, fy, intrinsics.width, intrinsics.height) <= 0:
         raise InputError(f"{where}: focal length or size is zero, negative or NaN. Export the sparse model again.")
     qw, qx, qy, qz, *translation = image.pose

@@ -48,17 +48,19 @@ def find_photos(folder: Path) -> list[Path]:
     ]
 
 
-def report_missing(source: Path, missing: list[str], total: int) -> None:
-    """Raise InputError if any photos are missing.
+def all_found(source: Path, found: list[tuple[str, Path | None]]) -> list[Path]:
+    """Return the files of photos. Raises InputError if any are missing.
 
-    `missing` are the names of the missing photos. `total` is the number of all photos that the capture lists, missing or not. `source`
-    is the file or folder that lists them; the error message begins with it.
+    `found` has each photo's name and its file, which is None if the photo is missing. `source` is the file or folder that names the photos;
+    the error message begins with it.
     """
+    missing = [name for name, file in found if file is None]
     if missing:
         raise InputError(
-            f"{source}: {len(missing)} of the {total} images it names are missing, the first is {missing[0]}. "
+            f"{source}: {len(missing)} of the {len(found)} images it names are missing, the first is {missing[0]}. "
             "Put them back, or remove them from the file."
         )
+    return [file for _, file in found if file is not None]
 
 
 class Masks:

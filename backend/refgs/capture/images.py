@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageFile
 from pillow_heif import register_heif_opener
 
 from refgs.camera import Camera
@@ -213,7 +213,12 @@ def read_alpha(view: View) -> np.ndarray | None:
     """
     if view.mask_path is None:
         return read_image(view.image_path)[1] if view.has_alpha else None
-    mask = read_mask(view.mask_path, view.mask_below)
+    return _file_mask(view, view.mask_path)
+
+
+def _file_mask(view: View, file: Path) -> np.ndarray:
+    """Read a view's mask from its file, as `read_alpha` does."""
+    mask = read_mask(file, view.mask_below)
     if mask.shape != (view.camera.height, view.camera.width):
         mask = np.rot90(mask, -read_header(view.image_path).turns).copy()  # torch takes no negative strides
     return mask
@@ -236,7 +241,7 @@ def load_view(view: View, max_side: int | None = None) -> LoadedView:
     image, own_alpha, white = read_codes(view.image_path, shrink)
     alpha = own_alpha if view.has_alpha else None
     if view.mask_path is not None:
-        alpha = read_alpha(view)
+        alpha = _file_mask(view, view.mask_path)
         if alpha.shape != (camera.height, camera.width):
             raise InputError(f"{view.mask_path}: the mask changed its size since the capture was read. Start again.")
     if lens is None and fitted is camera:
@@ -265,7 +270,7 @@ def _divisor(shrink: int, width: int, height: int) -> int:
     return shrink
 
 
-def _open(path: Path) -> Image.Image:
+def _open(path: Path) -> ImageFile.ImageFile:
     try:
         picture = Image.open(path, formats=FORMATS)
     except FileNotFoundError:
@@ -284,7 +289,7 @@ def _turns(picture: Image.Image) -> int:
         return 0
     try:
         # Not picture.getexif(), which decodes a PNG to look behind its pixels.
-        return _TURNS.get(Image.Image.getexif(picture).get(ExifTags.Base.Orientation), 0)
+        return _TURNS.get(Image.Image.getexif(picture).get(ExifTags.Base.Orientation, 1), 0)
     except Exception:  # broken EXIF: the pixels are still good
         return 0
 
@@ -317,7 +322,7 @@ def _as_array(picture: Image.Image) -> np.ndarray:
     return pixels
 
 
-def _decode_16_bit(picture: Image.Image, path: Path) -> np.ndarray | None:
+def _decode_16_bit(picture: ImageFile.ImageFile, path: Path) -> np.ndarray | None:
     """Decode a PNG or TIFF with 16 bits a channel to RGB or RGBA uint16 (H, W, 3 | 4). Return None for other pictures.
 
     Pillow keeps the upper 8 bits of colours, so OpenCV decodes them. It does not detect a truncated file, but Pillow does.

@@ -23,7 +23,7 @@ from refgs.camera import Camera
 from refgs.capture import View, load_view, read_files, to_run_frame
 from refgs.capture.backdrop import Backdrop, find_plane
 from refgs.capture.box import Box
-from refgs.capture.colmap import find_model, masks_root
+from refgs.capture.colmap import capture_root
 from refgs.capture.images import read_image
 from refgs.capture.lens import Lens
 from refgs.capture.region import LOOK_OUT, WHITE_MASKS, find_region, sample_silhouettes, up_direction
@@ -223,9 +223,7 @@ def _root(capture: Capture) -> Path:
         raise InputError(
             f"{capture.folder}: the masks of a nero capture are its depth maps, 0-depth.png … Put them there."
         )
-    if capture.layout != "colmap":
-        return capture.folder
-    return masks_root(find_model(capture.folder)[0])
+    return capture_root(capture.folder, capture.layout)
 
 
 def _inner(view: View, root: Path) -> Path:
@@ -317,15 +315,15 @@ def _read_strokes(file: Path, view: View, camera: Camera) -> np.ndarray:
     for side in sides:
         part = cv2.resize(side.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         if view.lens is not None:
-            part = cv2.remap(part, *_small_lens(view, camera).maps(camera), cv2.INTER_LINEAR)
+            part = cv2.remap(part, *_small_lens(view.lens, view.camera, camera).maps(camera), cv2.INTER_LINEAR)
         drawn.append(part)
     ours, theirs = drawn
     return np.where(np.maximum(ours, theirs) < 0.3, 0, np.where(ours >= theirs, 1, -1)).astype(np.int8)
 
 
-def _small_lens(view: View, camera: Camera) -> Lens:
-    """Return the lens of a photo that was reduced to the size of `camera`."""
-    return view.lens.resized(camera.width / view.camera.width, camera.height / view.camera.height)
+def _small_lens(lens: Lens, camera: Camera, small: Camera) -> Lens:
+    """Return the lens of a photo that was reduced from the size of `camera` to that of `small`."""
+    return lens.resized(small.width / camera.width, small.height / camera.height)
 
 
 def _to_photo(view: View, mask: np.ndarray) -> np.ndarray:
@@ -336,7 +334,7 @@ def _to_photo(view: View, mask: np.ndarray) -> np.ndarray:
     if view.lens is not None:
         # Distorted before it is enlarged: a lens bends little within a reduced pixel, and full size takes seconds.
         small = view.camera.resized(mask.shape[1], mask.shape[0])
-        maps = _small_lens(view, small).maps_back(small)
+        maps = _small_lens(view.lens, view.camera, small).maps_back(small)
         smooth = cv2.remap(smooth, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     large = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_CUBIC)
     sharpness = max(1.0, max(width, height) / max(mask.shape))

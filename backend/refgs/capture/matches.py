@@ -48,7 +48,7 @@ def match_neighbours(views: list[LoadedView]) -> list[Matches]:
         second = int(distance.argmin())
         pairs.add((min(first, second), max(first, second)))
     features = {index: _features(views[index]) for index in sorted({index for pair in pairs for index in pair})}
-    found = (Matches(*pair, *_match(*(features[index] for index in pair))) for pair in sorted(pairs))
+    found = (Matches(first, second, *_match(features[first], features[second])) for first, second in sorted(pairs))
     return [matches for matches in found if len(matches.ours) >= LEAST]
 
 
@@ -77,11 +77,11 @@ def _features(view: LoadedView) -> tuple[np.ndarray, np.ndarray | None]:
     camera = view.camera.fitted(SIDE)
     size = camera.width, camera.height
     grey = cv2.resize(cv2.cvtColor(view.bytes, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
-    inside = None
+    inside = np.empty(0, np.uint8)  # no mask
     if view.alpha is not None:
         alpha = cv2.resize(view.alpha, size, interpolation=cv2.INTER_AREA)
         inside = cv2.erode((alpha > 127).astype(np.uint8), np.ones((5, 5), np.uint8))
-    points, descriptors = cv2.SIFT_create(FEATURES, contrastThreshold=0.01).detectAndCompute(grey, inside)
+    points, descriptors = cv2.SIFT.create(FEATURES, contrastThreshold=0.01).detectAndCompute(grey, inside)
     # OpenCV counts pixels from the centre of the first one, cameras from its corner.
     return np.array([point.pt for point in points]).reshape(-1, 2) + 0.5, descriptors
 
@@ -91,11 +91,12 @@ def _match(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Match the features of two photos. Returns the pixels (M, 2) in both, of distinct matches that fit one epipolar geometry."""
     nothing = np.zeros((0, 2)), np.zeros((0, 2))
-    if any(descriptors is None or len(descriptors) < LEAST for _, descriptors in (ours, theirs)):
+    (first, described), (second, others) = ours, theirs
+    if described is None or others is None or min(len(described), len(others)) < LEAST:
         return nothing
-    nearest = cv2.BFMatcher().knnMatch(ours[1], theirs[1], k=2)
+    nearest = cv2.BFMatcher().knnMatch(described, others, k=2)
     kept = [best for best, other in nearest if best.distance < DISTINCT * other.distance]
-    first, second = ours[0][[m.queryIdx for m in kept]], theirs[0][[m.trainIdx for m in kept]]
+    first, second = first[[m.queryIdx for m in kept]], second[[m.trainIdx for m in kept]]
     if len(kept) < LEAST:
         return nothing
     cv2.setRNGSeed(0)

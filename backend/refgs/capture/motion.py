@@ -145,8 +145,8 @@ def _enough(placed: set[str], photos: list[Path]) -> bool:
 def _find_masks(folder: Path, photos: list[Path]) -> list[Path]:
     """Return the mask file of each photo. Return an empty list unless all photos have one. Raise InputError if one has another size."""
     known = Masks(folder)
-    masks = [known.find(photo, None, "") for photo in photos]
-    if not all(masks):
+    masks = [mask for photo in photos if (mask := known.find(photo, None, "")) is not None]
+    if len(masks) < len(photos):
         return []
     for photo, mask in zip(photos, masks, strict=True):
         header, size = read_header(photo), read_header(mask).upright
@@ -212,9 +212,12 @@ def _run_colmap_in_child(
 def end_with_parent() -> None:
     """Make this process, a child by `multiprocessing`, end as soon as its parent does, whatever it is doing then."""
 
+    parent = multiprocessing.parent_process()
+
     def wait() -> None:
-        multiprocessing.parent_process().join()
-        os._exit(1)
+        if parent is not None:
+            parent.join()
+            os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
 

@@ -32,8 +32,7 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.nda
         return "train" if train is None or frame.file_path in train else None
 
     frames, warnings = _without_deleted(found, file)
-    chosen = [(frame, split(frame)) for frame in frames]
-    views = read_views(file, [(frame, which) for frame, which in chosen if which is not None])
+    views = read_views(file, [(frame, which) for frame in frames if (which := split(frame)) is not None])
     points, colors = _read_points(folder / found.ply_file_path) if found.ply_file_path else (None, None)
     return views, points, colors, warnings
 

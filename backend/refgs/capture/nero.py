@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from refgs.camera import Camera
-from refgs.capture.files import photo_view, report_missing
+from refgs.capture.files import all_found, photo_view
 from refgs.capture.images import read_header
 from refgs.capture.pickles import read_pair
 from refgs.capture.poses import world_to_camera
@@ -26,8 +26,8 @@ def read_nero(folder: Path) -> tuple[list[View], list[str]]:
     """Read a NeRO capture. Return its views (photos with cameras) in NeRO's coordinates, and warnings. Raises InputError."""
     names = (file.name.removesuffix("-camera.pkl") for file in folder.glob("*-camera.pkl"))
     numbers = sorted(int(name) for name in names if name.isdecimal())
-    photos = [folder / f"{number}.png" for number in numbers]
-    report_missing(folder, [photo.name for photo in photos if not photo.is_file()], len(photos))
+    named = [folder / f"{number}.png" for number in numbers]
+    photos = all_found(folder, [(photo.name, photo if photo.is_file() else None) for photo in named])
     tested, warnings = _test_numbers(folder, numbers)
     views = []
     for number, photo in zip(numbers, photos, strict=True):
@@ -44,7 +44,7 @@ def _camera(file: Path, name: str, width: int, height: int) -> Camera:
     pose, matrix = read_pair(file)
     if np.shape(pose) != (3, 4) or np.shape(matrix) != (3, 3):
         raise InputError(f"{file}: not a (3, 4) pose and a (3, 3) intrinsic matrix. Download the data set again.")
-    (fx, skew, cx), (_, fy, cy), _ = matrix.astype(float).tolist()
+    (fx, skew, cx), (_, fy, cy), _ = np.asarray(matrix, float).tolist()
     if not np.isfinite(matrix).all() or min(fx, fy) <= 0 or abs(skew) > 1e-6 * fx:
         raise InputError(f"{file}: the focal length is zero, negative or NaN, or the pixels are skewed. Correct it.")
     try:

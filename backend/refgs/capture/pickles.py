@@ -7,7 +7,9 @@ from these later. A file that names any other class or function is refused.
 
 import io
 import pickle
+from collections.abc import Callable
 from pathlib import Path
+from typing import Literal, cast
 
 import numpy as np
 
@@ -55,7 +57,7 @@ class _Array:
 
     def __setstate__(self, state: tuple):
         _, self.shape, self.dtype, fortran, self.data = state
-        self.order = "F" if fortran else "C"
+        self.order: Literal["C", "F"] = "F" if fortran else "C"
 
     def numpy(self) -> np.ndarray:
         kind = self.dtype.kind.lstrip("<>=|")
@@ -93,13 +95,19 @@ for _core in ("numpy.core", "numpy._core"):
     _NAMES[f"{_core}.numeric", "_frombuffer"] = _from_buffer
 
 
+_Step = Callable[[pickle.Unpickler], None]
+
+
 class _Arrays(pickle._Unpickler):
     """Read a pickle in Python, by the classes and functions of `_NAMES` alone. Reading in C, a few bytes could reserve gigabytes."""
+
+    read: Callable[[int], bytes]  # `load` sets these two
+    append: Callable[[object], None]
 
     def load_bytearray8(self) -> None:
         self.append(bytearray(self.read(int.from_bytes(self.read(8), "little"))))  # `pickle` reserves the bytes first
 
-    dispatch = pickle._Unpickler.dispatch | {pickle.BYTEARRAY8[0]: load_bytearray8}
+    dispatch = pickle._Unpickler.dispatch | {pickle.BYTEARRAY8[0]: cast(_Step, load_bytearray8)}
 
     def find_class(self, module: str, name: str):
         try:

@@ -35,9 +35,9 @@ def world_to_camera(camera_to_world: object, where: str) -> np.ndarray:
         raise InputError(f"{where}: the pose is left-handed (it mirrors the world). {advice}")
     if stretch[0] > 1.01 * stretch[2]:
         raise InputError(f"{where}: the pose stretches or skews by {stretch[0] / stretch[2] - 1:.0%}. {advice}")
-    rotation = (u @ vt).T
+    inverse: np.ndarray = (u @ vt).T
     result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation, -rotation @ position
+    result[:3, :3], result[:3, 3] = inverse, -inverse @ position
     return result
 
 

@@ -75,7 +75,7 @@ def read_exif(path: Path) -> dict[int, Any]:
             exif.load_from_fp(file)  # most formats are TIFF
             return exif.get_ifd(ExifTags.IFD.Exif)
     except Exception:
-        with rawpy.imread(str(path)) as raw, Image.open(io.BytesIO(raw.extract_thumb().data)) as preview:
+        with rawpy.imread(str(path)) as raw, Image.open(io.BytesIO(bytes(raw.extract_thumb().data))) as preview:
             return Image.Image.getexif(preview).get_ifd(ExifTags.IFD.Exif)
 
 

@@ -143,12 +143,15 @@ def sample_silhouettes(views: list[View], count: int = 24) -> list[tuple[View, n
     """
     masked = [view for view in views if view.masked]
     chosen = masked[:: max(1, len(masked) // count)]
-    masks = [_small(read_alpha(view)) for view in chosen]
-    if masks and not any(mask.any() for mask in masks) and not any(read_alpha(view).any() for view in masked):
+    found = [(view, _small(alpha)) for view in chosen if (alpha := read_alpha(view)) is not None]
+    if found and not any(mask.any() for _, mask in found) and not any(map(_shows_something, masked)):
         raise empty_masks([view.mask_path or view.image_path for view in masked])
-    if all(mask.all() for mask in masks):
-        return []
-    return list(zip(chosen, masks, strict=True))
+    return [] if all(mask.all() for _, mask in found) else found
+
+
+def _shows_something(view: View) -> bool:
+    alpha = read_alpha(view)
+    return alpha is not None and bool(alpha.any())
 
 
 def empty_masks(files: list[Path]) -> InputError:
@@ -187,34 +190,43 @@ def _one_sided(views: list[View], centre: np.ndarray, up: np.ndarray) -> float:
 
 def _carve(
     silhouettes: list[tuple[View, np.ndarray]], centre: np.ndarray, half: float, box: Box | None = None
-) -> tuple | None:
+) -> tuple[np.ndarray, float] | None:
     """Return a ball (centre, radius) about the visual hull: the space that lies inside the masks of the photos. None if it is empty.
 
-    Test a grid of 49³ points in the cube centre ± half. Then test a second grid of 49³ points, over the bounding box of the points that
-    were kept. A point is kept if at least half of the views (and at least two) see it, and if it is inside the mask in nine tenths of
-    these. If `box` is given, only points inside it are kept.
+    Test a grid in the cube centre ± half. Then test a second grid, over the bounding box of the points that were kept.
     """
-    low, high = centre - half, centre + half
-    for _ in range(2):
-        axes = [np.linspace(low[i], high[i], 49) for i in range(3)]
-        cell = np.array([axis[1] - axis[0] for axis in axes])
-        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        grid = grid if box is None else grid[box.contains(grid)]
-        inside, seen = np.zeros(len(grid)), np.zeros(len(grid))
-        for view, mask in silhouettes:
-            camera = view.camera.resized(mask.shape[1], mask.shape[0])
-            local = grid @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-            z = np.maximum(local[:, 2], 1e-9)
-            u, v = camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy
-            visible = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-            seen += visible
-            inside[visible] += mask[v[visible].astype(int), u[visible].astype(int)]
-        kept = grid[(seen >= max(2, 0.5 * len(silhouettes))) & (inside >= 0.9 * seen)]
-        if len(kept) == 0:
-            return None
-        low, high = kept.min(axis=0) - cell, kept.max(axis=0) + cell
+    kept, cell = _inside_masks(silhouettes, centre - half, centre + half, box)
+    if len(kept):
+        kept, cell = _inside_masks(silhouettes, kept.min(axis=0) - cell, kept.max(axis=0) + cell, box)
+    if not len(kept):
+        return None
+    low, high = kept.min(axis=0) - cell, kept.max(axis=0) + cell
     centre = (low + high) / 2
     return centre, float(np.linalg.norm(kept - centre, axis=1).max() + 0.5 * np.linalg.norm(cell))
+
+
+def _inside_masks(
+    silhouettes: list[tuple[View, np.ndarray]], low: np.ndarray, high: np.ndarray, box: Box | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (K, 3) of a grid that are inside the masks, and the size (3,) of the grid's cells.
+
+    The grid has 49³ points from `low` to `high`. A point is kept if at least half of the views (and at least two) see it, and if it is
+    inside the mask in nine tenths of these. If `box` is given, only points inside it are kept.
+    """
+    axes = [np.linspace(low[i], high[i], 49) for i in range(3)]
+    cell = np.array([axis[1] - axis[0] for axis in axes])
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = grid if box is None else grid[box.contains(grid)]
+    inside, seen = np.zeros(len(grid)), np.zeros(len(grid))
+    for view, mask in silhouettes:
+        camera = view.camera.resized(mask.shape[1], mask.shape[0])
+        local = grid @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        z = np.maximum(local[:, 2], 1e-9)
+        u, v = camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy
+        visible = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        seen += visible
+        inside[visible] += mask[v[visible].astype(int), u[visible].astype(int)]
+    return grid[(seen >= max(2, 0.5 * len(silhouettes))) & (inside >= 0.9 * seen)], cell
 
 
 def _foreground(views: list[View], points: np.ndarray, centre: np.ndarray, radius: float) -> tuple[np.ndarray, float]:

@@ -19,8 +19,8 @@ from refgs.errors import InputError, reason
 
 SIDE = 1024  # pixels that a model of any size gets
 MEAN, DEVIATION = (
-    np.float32([0.485, 0.456, 0.406]),
-    np.float32([0.229, 0.224, 0.225]),
+    np.array([0.485, 0.456, 0.406], np.float32),
+    np.array([0.229, 0.224, 0.225], np.float32),
 )  # of ImageNet's sRGB values in 0..1
 
 

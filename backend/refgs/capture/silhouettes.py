@@ -8,6 +8,7 @@ What is seen through a hole looks like the surroundings from neighbouring places
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import cv2
 import numpy as np
@@ -91,11 +92,11 @@ def carve_object(photos: list[Photo], box: Box, fill: float, backdrop: Backdrop 
     if any(photo.salient is not None for photo in photos):
         backdrop = None
     pixels = [_pixels(points, photo.camera) for photo in photos]
-    seen = sum((at >= 0).astype(int) for at in pixels)
+    seen = cast(np.ndarray, sum((at >= 0).astype(int) for at in pixels))
     allowed &= seen >= max(2, SEEN * len(photos))
     pairs = _neighbours(photos, box.centre)
     disagree = DISAGREE if backdrop is None else DISAGREE_PLANE
-    objects, colors = 0, None
+    shape, colors = None, None
     for turn in range(ROUNDS):
         priors = [_project_voxels(occupied, box, photo.camera, at) for photo, at in zip(photos, pixels, strict=True)]
         if backdrop is not None and turn in LEARNED:
@@ -118,16 +119,16 @@ def carve_object(photos: list[Photo], box: Box, fill: float, backdrop: Backdrop 
         kept = ordered[np.arange(len(points)), (disagree * seen).astype(int)] / np.float32(255)
         kept[~allowed | struck] = 0
         field = gaussian_filter(kept.reshape(GRID, GRID, GRID), 0.7)
-        parts, count = label(field > 0.5)
+        parts, count = cast(tuple[np.ndarray, int], label(field > 0.5))
         if count == 0:
             return None
         sizes = np.bincount(parts.ravel())
         sizes[0] = 0
         large = sizes >= COUNTED * sizes.max()
-        objects = int(large.sum())
         occupied = np.where(large[parts] | (parts == 0), field, 0).ravel()
+        shape = Shape(box, occupied, int(large.sum()), colors, backdrop)
         progress(turn + 1, ROUNDS)
-    return Shape(box, occupied, objects, colors, backdrop)
+    return shape
 
 
 def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
@@ -140,7 +141,7 @@ def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (margin, margin))
     solid = (prior > 0.5).astype(np.uint8)
     inner = kernel if plain is None else np.ones((5, 5), np.uint8)
-    core = cv2.erode(solid, inner, borderValue=1) > 0
+    core = cv2.erode(solid, inner, borderValue=(1,)) > 0
     around = cv2.dilate(((prior > NEAR) | (photo.known > 0)).astype(np.uint8), kernel) > 0
     labels = np.where(likely, np.uint8(cv2.GC_PR_FGD), np.uint8(cv2.GC_PR_BGD))
     labels[core & likely] = cv2.GC_FGD
@@ -160,7 +161,7 @@ def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
         inner = labels[part].copy()
         if ((inner & 1) > 0).any() and ((inner & 1) == 0).any():
             image = np.ascontiguousarray(photo.image[part][..., ::-1])
-            cv2.grabCut(image, inner, None, np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
+            cv2.grabCut(image, inner, (0, 0, 0, 0), np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
             labels[part] = inner
     mask = _only_connected(labels & 1, solid > 0, photo.known)
     return np.where(mask, np.uint8(255), np.uint8(0))

@@ -17,7 +17,7 @@ folder further up. The views `val_000` … are not used.
 
 from pathlib import Path
 
-from refgs.capture.files import photo_view, report_missing
+from refgs.capture.files import all_found, photo_view
 from refgs.capture.images import read_header
 from refgs.capture.transforms import frame_camera
 from refgs.capture.types import Split, View
@@ -40,15 +40,17 @@ def is_tensoir(folder: Path) -> bool:
 
 def read_tensoir(folder: Path) -> tuple[list[View], list[str]]:
     """Read the training and test views of a TensoIR capture, in the capture's coordinates, and warnings. Raises InputError."""
-    found: list[tuple[Path, Split]] = []
-    for split in ("train", "test"):
-        found += [(file.parent, split) for file in sorted(folder.glob(f"{split}_[0-9]*/metadata.json"))]
-    report_missing(folder, [f"{view.name}/{PHOTOS[0]}" for view, _ in found if _photo(view) is None], len(found))
+    found = _folders(folder, "train") + _folders(folder, "test")
+    photos = all_found(folder, [(f"{view.name}/{PHOTOS[0]}", _photo(view)) for view, _ in found])
     warnings = []
     if light_folder(folder) is None:
         what = "Environment_Maps is neither beside the scene's folder nor above it"
         warnings.append(f"{what}: the evaluation does not relight without its panoramas")
-    return [_view(view, split) for view, split in found], warnings
+    return [_view(view, photo, split) for (view, split), photo in zip(found, photos, strict=True)], warnings
+
+
+def _folders(folder: Path, split: Split) -> list[tuple[Path, Split]]:
+    return [(file.parent, split) for file in sorted(folder.glob(f"{split}_[0-9]*/metadata.json"))]
 
 
 def light_folder(folder: Path) -> Path | None:
@@ -61,8 +63,8 @@ def _photo(folder: Path) -> Path | None:
     return next((folder / name for name in PHOTOS if (folder / name).is_file()), None)
 
 
-def _view(folder: Path, split: Split) -> View:
-    file, photo = folder / "metadata.json", _photo(folder)
+def _view(folder: Path, photo: Path, split: Split) -> View:
+    file = folder / "metadata.json"
     found = read_metadata(file)
     frame = Frame(
         file_path=folder.name,

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from refgs.camera import Camera
-from refgs.capture.files import IMAGE_SUFFIXES, Masks, find_image, photo_view, report_missing
+from refgs.capture.files import IMAGE_SUFFIXES, Masks, all_found, find_image, photo_view
 from refgs.capture.images import read_header
 from refgs.capture.lens import Lens
 from refgs.capture.poses import OPENGL_TO_OPENCV, world_to_camera
@@ -38,7 +38,7 @@ def frame_camera(frame: Frame, where: str, image_size: tuple[int, int] | None = 
     fx = _focal(frame.fl_x, frame.camera_angle_x, width)
     fy = _focal(frame.fl_y, frame.camera_angle_y, height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
-    if fx is None:
+    if fx is None or fy is None:
         raise InputError(f"{where}: no focal length. Add fl_x (pixels) or camera_angle_x (radians) to the file.")
     cx, cy = width / 2 if frame.cx is None else frame.cx, height / 2 if frame.cy is None else frame.cy
     finite = all(math.isfinite(x) for x in (fx, fy, cx, cy, width, height))
@@ -60,11 +60,10 @@ def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> list[View]:
     `frames` are pairs of a frame and its split, "train" or "test". Raises InputError.
     """
     folder = file.parent
-    found = [(frame, split, find_image(folder / frame.path)) for frame, split in frames]
-    report_missing(file, [frame.path for frame, _, path in found if path is None], len(found))
+    found = all_found(file, [(frame.path, find_image(folder / frame.path)) for frame, _ in frames])
     masks = Masks(folder)
     views = []
-    for frame, split, image in found:
+    for (frame, split), image in zip(frames, found, strict=True):
         named = where(file, frame)
         mask = masks.find(image, frame.mask_path, named)
         camera = frame_camera(frame, named, read_header(image)[:2])

@@ -9,6 +9,8 @@ from typing import Any
 import av
 import cv2
 import numpy as np
+from av.container import InputContainer
+from av.error import FFmpegError
 from av.video.reformatter import ColorPrimaries, ColorTrc, VideoReformatter
 from PIL import Image
 
@@ -112,7 +114,7 @@ def movement(before: np.ndarray, after: np.ndarray) -> float:
     corners = cv2.goodFeaturesToTrack(before, 400, 0.01, 5)
     if corners is None:
         return np.inf
-    tracked, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None)
+    tracked, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, np.empty_like(corners))
     distance = np.linalg.norm(tracked - corners, axis=-1).ravel()
     distance[found.ravel() == 0] = np.inf
     return float(np.quantile(distance, 0.9, method="higher")) / max(before.shape)
@@ -129,11 +131,11 @@ def _products(*pictures: np.ndarray) -> np.ndarray:
     return np.array([[np.vdot(one, other) for other in pictures] for one in pictures], np.float64)
 
 
-def _opened(video: Path) -> av.container.InputContainer:
+def _opened(video: Path) -> InputContainer:
     """Open a video file. Raise InputError if it is not a video, or if its header is missing because it is truncated."""
     try:
         container = av.open(str(video), metadata_errors="replace")
-    except (av.FFmpegError, OSError) as error:
+    except (FFmpegError, OSError) as error:
         why = error.strerror or type(error).__name__
         raise InputError(
             f"{video}: this is not a video that can be read ({why}). Copy it from the phone again, or save it as MP4."
@@ -144,15 +146,15 @@ def _opened(video: Path) -> av.container.InputContainer:
     return container
 
 
-def _length(container: av.container.InputContainer) -> float:
+def _length(container: InputContainer) -> float:
     """Return the length of a video in seconds, 0 if the file does not say it."""
     stream = container.streams.video[0]
-    if stream.duration:
+    if stream.duration and stream.time_base:
         return float(stream.duration * stream.time_base)
     return (container.duration or 0) / av.time_base
 
 
-def _frames(video: Path, container: av.container.InputContainer) -> Iterator[tuple[float, av.VideoFrame]]:
+def _frames(video: Path, container: InputContainer) -> Iterator[tuple[float, av.VideoFrame]]:
     """Decode a video. Yield each frame with its time in seconds, from 0. Raise InputError where it is broken or truncated."""
     stream = container.streams.video[0]
     stream.thread_type = "AUTO"
@@ -166,7 +168,7 @@ def _frames(video: Path, container: av.container.InputContainer) -> Iterator[tup
             start = frame.time if start is None else start
             time = frame.time - start
             yield time, frame
-    except av.FFmpegError as error:
+    except FFmpegError as error:
         why = error.strerror or type(error).__name__
         raise InputError(f"{video}: it is broken after {time:.1f} seconds ({why}). {again}") from error
     if start is None:
@@ -176,7 +178,7 @@ def _frames(video: Path, container: av.container.InputContainer) -> Iterator[tup
 
 
 def _sharpest(
-    video: Path, container: av.container.InputContainer, work: Path, count: int, report: Callable
+    video: Path, container: InputContainer, work: Path, count: int, report: Callable
 ) -> tuple[int, list[_Candidate]]:
     """Find the sharpest frame of each of `count` stretches, and write it to the folder `work`. Stretches without frames are skipped.
 
@@ -190,8 +192,7 @@ def _sharpest(
     # Each converter keeps its tables. Those for HDR take seconds to compute.
     to_grey, to_color = VideoReformatter(), VideoReformatter()
 
-    def write() -> None:
-        measured, grey, frame = best
+    def write(measured: float, grey: np.ndarray, frame: av.VideoFrame) -> None:
         file = work / f"stretch_{current:05d}.jpg"
         Image.fromarray(_upright(frame, to_color)).save(file, quality=95, subsampling=0)
         scale = min(1.0, FLOW_SIDE / max(grey.shape))
@@ -205,7 +206,7 @@ def _sharpest(
         stretch = min(int(place), count - 1)
         if stretch != current:
             if best is not None:
-                write()
+                write(*best)
             current, best = stretch, None
         grey = _grey(frame, to_grey)
         measured = sharpness(grey)
@@ -215,7 +216,8 @@ def _sharpest(
         frames += 1
         facts = {"stage": "frames", "done": frames, "total": max(frames, round(length * rate))}
         report("progress", facts | so_far)
-    write()
+    if best is not None:
+        write(*best)
     return frames, candidates
 
 

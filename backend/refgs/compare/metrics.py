@@ -4,17 +4,19 @@ Pictures are float arrays (height, width, 3). "Encoded" means sRGB values in 0..
 the mean of their errors.
 """
 
+import importlib
 import importlib.util
 import math
 from collections.abc import Callable, Iterable
 from functools import lru_cache
 from pathlib import Path
+from typing import cast
 
 import cv2
 import flip_evaluator
 import numpy as np
 import torch
-from scipy.ndimage import maximum_filter, median_filter
+from scipy.ndimage import maximum_filter, maximum_filter1d, median_filter
 from scipy.optimize import linear_sum_assignment
 from skimage.metrics import structural_similarity
 
@@ -58,17 +60,16 @@ def fitted_exposure(radiance: np.ndarray, alpha: np.ndarray, photo: np.ndarray) 
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> float:
     """Compute the structural similarity (SSIM) of two sRGB-encoded pictures, with a Gaussian window of σ 1.5 pixels (Wang et al. 2004)."""
-    return float(
-        structural_similarity(
-            np.asarray(image, np.float64),
-            np.asarray(reference, np.float64),
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=False,
-            data_range=1.0,
-            channel_axis=-1,
-        )
+    mean = structural_similarity(
+        np.asarray(image, np.float64),
+        np.asarray(reference, np.float64),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
     )
+    return float(cast(np.float64, mean))
 
 
 def flip(image: np.ndarray, reference: np.ndarray) -> float:
@@ -76,8 +77,8 @@ def flip(image: np.ndarray, reference: np.ndarray) -> float:
 
     The viewing distance is the authors' default: one degree of the field of view spans 67 pixels.
     """
-    pair = (np.ascontiguousarray(x, np.float32) for x in (reference, image))
-    error, *_ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False)
+    true, shown = (np.ascontiguousarray(x, np.float32) for x in (reference, image))
+    error, *_ = flip_evaluator.evaluate(true, shown, "LDR", applyMagma=False, computeMeanError=False)
     return float(error.mean(dtype=np.float64))
 
 
@@ -88,7 +89,7 @@ def specks(image: np.ndarray, reference: np.ndarray) -> float:
     reference, as on thin lines and small highlights, are not counted.
     """
     stands_out = [(np.abs(x - median_filter(x, (5, 5, 1))) > SPECK).any(axis=-1) for x in (image, reference)]
-    return 1e3 * float((stands_out[0] & ~maximum_filter(stands_out[1], 3)).mean())
+    return 1e3 * float((stands_out[0] & np.logical_not(maximum_filter(stands_out[1], 3))).mean())
 
 
 def lpips_missing() -> str | None:
@@ -105,8 +106,7 @@ def lpips_missing() -> str | None:
 
 @lru_cache(maxsize=1)
 def _lpips_network():
-    import lpips
-
+    lpips = importlib.import_module("lpips")  # no dependency of ours
     return lpips.LPIPS(net="vgg", verbose=False).eval()
 
 
@@ -259,7 +259,8 @@ def find_lights(panorama: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     luminance = luminance / max((luminance * area).sum() / area.sum(), 1e-30)
     blurred = _blur(luminance, LIGHT_BLUR)
     rays = directions(*luminance.shape).astype(np.float64)
-    peaks = (blurred >= maximum_filter(blurred, size=3, mode=("nearest", "wrap"))) & (blurred > 1.01)
+    around = maximum_filter1d(maximum_filter1d(blurred, 3, axis=0, mode="nearest"), 3, axis=1, mode="wrap")
+    peaks = (blurred >= around) & (blurred > 1.01)
     found: list[np.ndarray] = []
     values = []
     for place in sorted(zip(*np.nonzero(peaks), strict=True), key=lambda place: -blurred[place]):

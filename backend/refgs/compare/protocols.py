@@ -73,7 +73,8 @@ def similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray, scaled: b
         image = np.where(power > 1e-6, image * ((image * photo).sum(axis=(0, 1)) / np.maximum(power, 1e-6)), image)
     clipped = np.clip(photo, 0, 1)
     factor = srgb_encode(clipped).mean() / clipped.mean() if clipped.mean() > 1e-8 else 1.0
-    found = {"psnr_h": _psnr(*(np.clip(x * factor, 0, MOST_RADIANCE) for x in (image, photo)), inside)}
+    rendered, real = (np.clip(x * factor, 0, MOST_RADIANCE) for x in (image, photo))
+    found = {"psnr_h": _psnr(rendered, real, inside)}
     shown, taken = (srgb_encode(np.clip(x, 0, 1)) for x in (image, photo))
     found |= {"psnr_l": _psnr(shown, taken, inside), "ssim": _small_ssim(shown, taken)}
     return found | ({"lpips": metrics.lpips(srgb_encode(shown), srgb_encode(taken))} if lpips else {})

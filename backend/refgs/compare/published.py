@@ -31,11 +31,12 @@ class TensoIRTruth(GroundTruth):
     """
 
     def _find(self) -> None:
-        first, self._lights = self.folder / "train_000", light_folder(self.folder)
+        first, lights = self.folder / "train_000", light_folder(self.folder)
         self.passes = [name for name in ("normal", "albedo") if (first / f"{name}.png").is_file()]
-        if self._lights is not None:
-            lights = [light for light in LIGHTS if self._light_file(light).is_file()]
-            self.hdris = [light for light in lights if (first / f"rgba_{light}.png").is_file()]
+        if lights is not None:
+            self._lights = lights
+            known = [light for light in LIGHTS if self._light_file(light).is_file()]
+            self.hdris = [light for light in known if (first / f"rgba_{light}.png").is_file()]
 
     def _read(self, name: str, camera: Camera) -> np.ndarray:
         pixels, alpha = self._pixels(self.passes[0] if name == "alpha" else name, camera)

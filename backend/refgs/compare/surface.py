@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 
 from refgs.camera import Camera
 from refgs.formats.mesh import Mesh
@@ -38,7 +38,7 @@ def compare(mesh: Mesh, truth: Mesh, cameras: list[Camera]) -> dict[str, float]:
     samples = []
     for one in (mesh, truth):
         solid = trimesh.Trimesh(one.vertices, one.faces, process=False)
-        points, face = trimesh.sample.sample_surface(solid, POINTS, seed=0)
+        points, face = trimesh.sample.sample_surface(solid, POINTS, seed=0)[:2]
         samples.append((solid, np.asarray(points), face, seen(one, points, cameras, _OFFSET * unit)))
     if not all(visible.any() for *_, visible in samples):
         return {}

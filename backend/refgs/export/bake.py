@@ -1,5 +1,7 @@
 """Bake a mesh's textures from the splats around it."""
 
+from typing import cast
+
 import cv2
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -7,7 +9,7 @@ from embreex.rtcore_scene import EmbreeScene
 from scipy.ndimage import distance_transform_edt
 
 from refgs.export.occlusion import openness
-from refgs.formats.mesh import Mesh
+from refgs.formats.mesh import UnwrappedMesh
 from refgs.formats.splats import Splats
 from refgs.formats.tangents import vertex_tangents
 from refgs.formats.textures import Textures
@@ -19,12 +21,12 @@ _ROWS = 64  # rows of texels at a time
 _NEIGHBOURS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)]
 
 
-def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done, total: None) -> Textures:
+def bake(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress = lambda done, total: None) -> Textures:
     """Bake the textures of a mesh, `size` texels on each side, from the splats around it.
 
     Each texel has a point on the mesh. Base colour, metallic, roughness, normal, and doubt if the splats have one, come from `composite` at
     this point, occlusion from `openness`. A texel just outside a chart (a connected piece of the uv layout) has a point on the plane of the
-    nearest face. `mesh` must have normals and uv, as made by `unwrap`. `progress` is called with the number of points done and their total.
+    nearest face. `progress` is called with the number of points done and their total.
     """
     coarse = _composited(mesh, splats, size, progress)
     tangents, signs = vertex_tangents(mesh)
@@ -46,10 +48,11 @@ def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done
         if doubt is not None:
             doubt[rows][on] = texels[:, 8]
     _pad([*maps, doubt] if doubt is not None else maps, mask)
-    return Textures(*maps, mask, specular=float(splats.constants.get("specular", 1.0) > 0), doubt=doubt)
+    specular = float(splats.constants.get("specular", 1.0) > 0)
+    return Textures(color, metallic, roughness, occlusion, normal, mask, specular, doubt)
 
 
-def _composited(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:
+def _composited(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:
     """Composite the splats' values at the texels of a texture. Returns (C, C, K), with the K values of `composite`.
 
     C is smaller than `size` if the splats are large: FINE texels per standard deviation of a splat are enough.
@@ -94,7 +97,7 @@ def _enlarged_rows(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
 
 def _pad(maps: list[np.ndarray], mask: np.ndarray) -> None:
     """Fill each texel outside the mask with the values of the nearest texel inside it."""
-    nearest = distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    nearest = cast(np.ndarray, distance_transform_edt(~mask, return_distances=False, return_indices=True))
     for rows in _row_blocks(len(mask)):
         for values in maps:
             values[rows] = values[tuple(nearest[:, rows])]
@@ -121,7 +124,7 @@ def _in_tangent_space(vectors: np.ndarray, *basis: np.ndarray) -> np.ndarray:
     return local / np.linalg.norm(local, axis=1, keepdims=True)
 
 
-def _uv_scene(mesh: Mesh, size: int) -> EmbreeScene:
+def _uv_scene(mesh: UnwrappedMesh, size: int) -> EmbreeScene:
     """Make a ray-tracing scene of the mesh's uv layout: a flat mesh, in units of texels."""
     flat = np.concatenate([mesh.uv * size, np.zeros((len(mesh.uv), 1))], axis=1).astype(np.float32)
     scene = EmbreeScene()
@@ -129,7 +132,9 @@ def _uv_scene(mesh: Mesh, size: int) -> EmbreeScene:
     return scene
 
 
-def _rasterise(mesh: Mesh, scene: EmbreeScene, size: int, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _rasterise(
+    mesh: UnwrappedMesh, scene: EmbreeScene, size: int, rows: slice
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the face and the point of the mesh for each texel in `rows` of a texture. R is the number of rows, S is `size`.
 
     Returns the index of the face (R, S), −1 if none, the barycentric weights in it (R, S, 3), and the point (R, S, 3). `scene` is the
@@ -141,7 +146,7 @@ def _rasterise(mesh: Mesh, scene: EmbreeScene, size: int, rows: slice) -> tuple[
     first, last = max(rows.start - 1, 0), min(rows.stop + 1, size)
     y, x = np.mgrid[first:last, :size].astype(np.float32) + np.float32(0.5)
     origins = np.stack([x, size - y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    hit = scene.run(origins, np.tile(np.float32([0, 0, -1]), (len(origins), 1)), output=1)
+    hit = scene.run(origins, np.tile(np.array([0, 0, -1], np.float32), (len(origins), 1)), output=1)
     face = np.where(hit["tfar"] < 1e30, hit["primID"], -1).reshape(x.shape)
     weights = np.stack([1 - hit["u"] - hit["v"], hit["u"], hit["v"]], axis=-1).reshape(*x.shape, 3)
     inside = face >= 0

@@ -7,7 +7,7 @@ import torch
 
 from refgs.camera import Camera
 from refgs.formats.splats import Splats
-from refgs.model.adam import Adam
+from refgs.model.learned import Learned
 from refgs.render.baselines import draw_colors
 from refgs.run import Run
 
@@ -33,21 +33,22 @@ def displayed(run: Run, progress: Callable[[int, int], None] = lambda done, tota
     cameras = run.training_cameras()
     cameras = [camera.fitted(SIDE) for camera in cameras[:: -(-len(cameras) // VIEWS)]]
     shown: dict[int, torch.Tensor] = {}
-    constant = torch.from_numpy(splats.sh[:, :1].copy()).requires_grad_()
-    rest = torch.zeros(len(splats), (DEGREE + 1) ** 2 - 1, 3, requires_grad=True)
-    adam = Adam([{"params": [constant], "lr": RATE}, {"params": [rest], "lr": RATE_OF_REST}])
-    order = np.random.default_rng(0)
+    learned = Learned()
+    learned.learn("sh_dc", torch.from_numpy(splats.sh[:, :1].copy()))
+    learned.learn("sh_rest", torch.zeros(len(splats), (DEGREE + 1) ** 2 - 1, 3))
+    learned.rates |= {"sh_dc": RATE, "sh_rest": RATE_OF_REST}
+    constant, rest = learned["sh_dc"], learned["sh_rest"]
+    order, queue = np.random.default_rng(0), []
     for iteration in range(ITERATIONS):
-        if iteration % len(cameras) == 0:
-            queue = order.permutation(len(cameras))
-        number = int(queue[iteration % len(cameras)])
+        if not queue:
+            queue = order.permutation(len(cameras)).tolist()
+        number = queue.pop(0)
         if number not in shown:
             shown[number] = run.render(cameras[number]).color.detach().clamp(0, 1)
         loss = (_by_direction(run, constant, rest, cameras[number]) - shown[number]).square().mean()
         constant.grad, rest.grad = torch.autograd.grad(loss, (constant, rest))
-        adam.step()
-        for group in adam.param_groups:
-            group["lr"] *= 0.1 ** (1 / ITERATIONS)
+        learned.step()
+        learned.rates = {name: rate * 0.1 ** (1 / ITERATIONS) for name, rate in learned.rates.items()}
         progress(iteration + 1, ITERATIONS)
     sh = torch.cat([constant, rest], dim=1).detach().numpy()
     return Splats(**{**splats.__dict__, "sh": sh})

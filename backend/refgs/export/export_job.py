@@ -6,7 +6,7 @@ Importing torch takes seconds. So all checks that do not need torch come first.
 import warnings
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from refgs.errors import InputError, InputWarning
 from refgs.events import Report
@@ -18,6 +18,7 @@ from refgs.run_folder import check_finished
 LESS = "close other programs, or export less: a smaller --texture, or train with a smaller mesh.resolution"
 
 if TYPE_CHECKING:
+    from refgs.formats.mesh import Mesh, UnwrappedMesh
     from refgs.formats.splats import Splats
     from refgs.run import Run
 
@@ -57,7 +58,7 @@ def export(
     make_folders(folders)
     with shortage_named(LESS), disk_errors_named(folders, "export again"):
         _write_splats(run, source, splats_file, display_file, report)
-        if target is None:
+        if run is None or target is None:
             return splats
         with RunLock(folder) if target.parent == folder else nullcontext():
             _write_mesh(run, target, texture, report)
@@ -115,9 +116,11 @@ def _write_splats(run: "Run | None", source: "Splats", ours: Path | None, displa
 
     if ours is not None:
         write_splats(ours, source)
-    if display is not None and run is None:
+    if display is None:
+        return
+    if run is None:
         write_display_splats(display, source)  # a foreign PLY has its colours by direction
-    elif display is not None:
+    else:
         report("stage", {"what": "learning colours by direction"})
         write_display_splats(display, displayed(run, learned))
 
@@ -139,7 +142,7 @@ def _write_mesh(run: "Run", target: Path, texture: int | None, report: Report) -
     write(target, mesh, textures)
 
 
-def _make_mesh(run: "Run", report: Report) -> Any:
+def _make_mesh(run: "Run", report: Report) -> "UnwrappedMesh":
     """Make the run's mesh: fuse depth maps, simplify, fit the mesh to the outlines in renderings, and compute its uv."""
     from refgs.export.outline import fit_to_outlines
     from refgs.export.unwrap import layout, unwrap
@@ -164,7 +167,7 @@ def _make_mesh(run: "Run", report: Report) -> Any:
     return mesh
 
 
-def _baked_splats(run: "Run", mesh: Any) -> "Splats":
+def _baked_splats(run: "Run", mesh: "Mesh") -> "Splats":
     """Return the run's splats for baking. If their base colours contain shadows, the shadows are removed.
 
     Base colours contain shadows if the training computed no shadows and the light did not move relative to the object.
@@ -173,7 +176,8 @@ def _baked_splats(run: "Run", mesh: Any) -> "Splats":
     from refgs.render.baselines import method_of
 
     light = run.environment
-    fixed = light is not None and light.reference is None
-    if fixed and run.occluder is None and not method_of(run.settings.render).light.display:
-        return unshadowed(run.splats, run.surfels(), mesh, light)
-    return run.splats
+    if light is None or light.reference is not None or run.occluder is not None:
+        return run.splats
+    if method_of(run.settings.render).light.display:
+        return run.splats
+    return unshadowed(run.splats, run.surfels(), mesh, light)

@@ -4,14 +4,14 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from refgs.formats.mesh import Mesh
+from refgs.formats.mesh import SmoothMesh
 
 RAYS = 64
 _LIFT = 1e-3  # height of rays' start above the mesh, as a part of its size
 _CHUNK = 1 << 14  # vertices at a time
 
 
-def openness(mesh: Mesh) -> np.ndarray:
+def openness(mesh: SmoothMesh) -> np.ndarray:
     """Compute ambient occlusion at each vertex (V,): the fraction of a uniform light that the mesh does not block.
 
     The value 1 means that nothing blocks the light, as in glTF. RAYS rays start at each vertex. Their density is proportional to the cosine

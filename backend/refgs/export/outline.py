@@ -13,7 +13,7 @@ from embreex.rtcore_scene import EmbreeScene
 from scipy.sparse import coo_matrix, diags, identity
 
 from refgs.camera import Camera
-from refgs.formats.mesh import Mesh
+from refgs.formats.mesh import Mesh, SmoothMesh
 from refgs.geometry.mesh import smooth_normals
 from refgs.render.renderer import Rendering
 
@@ -25,7 +25,9 @@ ITERATIONS = 2  # the first moves all vertices by the median gap
 PRIOR = 0.05  # weight of a zero displacement, in outline pixels: vertices off the outlines stay
 
 
-def fit_to_outlines(mesh: Mesh, render: Callable[[Camera], Rendering], cameras: Sequence[Camera], voxel: float) -> Mesh:
+def fit_to_outlines(
+    mesh: SmoothMesh, render: Callable[[Camera], Rendering], cameras: Sequence[Camera], voxel: float
+) -> SmoothMesh:
     """Move a mesh's vertices along their normals until its outlines match the object's outlines in renderings.
 
     `render` makes the rendering for a camera. First all vertices move by the same distance, the median gap between the two outlines. Then
@@ -57,7 +59,7 @@ def fit_to_outlines(mesh: Mesh, render: Callable[[Camera], Rendering], cameras: 
         step -= smooth(_overshoot(vertices, views))
         step = step.clip(-most, most)
     vertices = mesh.vertices + step[:, None] * mesh.normals
-    return Mesh(vertices, mesh.faces, smooth_normals(vertices, mesh.faces))
+    return SmoothMesh(vertices, mesh.faces, smooth_normals(vertices, mesh.faces))
 
 
 def _overshoot(vertices: np.ndarray, views: list[tuple[Camera, np.ndarray]]) -> np.ndarray:
@@ -124,7 +126,7 @@ def _gaps(mesh: Mesh, camera: Camera, distance: np.ndarray) -> tuple[np.ndarray,
     hit = scene.run(origins, rays.astype(np.float32), output=1)
     depth = np.where(hit["tfar"] < 1e30, hit["tfar"], np.inf).reshape(x.shape)  # rays have depth 1
     covered = np.isfinite(depth).astype(np.uint8)
-    along = (covered > 0) & (cv2.erode(covered, np.ones((3, 3), np.uint8), borderValue=1) == 0)
+    along = (covered > 0) & (cv2.erode(covered, np.ones((3, 3), np.uint8), borderValue=(1,)) == 0)
     # On average the centres of the outermost pixels lie half a pixel inside the outline.
     gap = (_look_up(distance, x[along], y[along]) - 0.5) * depth[along] / camera.fx
     return mesh.faces[hit["primID"].reshape(x.shape)[along], 0], gap

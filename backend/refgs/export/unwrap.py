@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import xatlas
 
-from refgs.formats.mesh import Mesh
+from refgs.formats.mesh import Mesh, SmoothMesh, UnwrappedMesh
 
 # Most triangles of a part. xatlas's time grows faster than linearly with a mesh's triangles, and it unwraps meshes in parallel.
 PART = 800
@@ -25,7 +25,7 @@ class Layout:
     bend: float
 
 
-def unwrap(mesh: Mesh) -> Mesh:
+def unwrap(mesh: SmoothMesh) -> UnwrappedMesh:
     """Compute uv for a mesh with xatlas, which cuts it into charts (flat pieces). Returns a new mesh.
 
     Charts are at least 1/128 of the unit square's side apart. Vertices on seams are doubled and keep their normals. xatlas is slow for
@@ -50,7 +50,7 @@ def unwrap(mesh: Mesh) -> Mesh:
         uvs.append(uv * side)
         count += len(source)
     source = np.concatenate(sources)
-    return Mesh(mesh.vertices[source], faces, mesh.normals[source], np.concatenate(uvs))
+    return UnwrappedMesh(mesh.vertices[source], faces, mesh.normals[source], np.concatenate(uvs))
 
 
 def _parts(mesh: Mesh) -> list[np.ndarray]:
@@ -67,7 +67,7 @@ def _parts(mesh: Mesh) -> list[np.ndarray]:
     return done
 
 
-def layout(mesh: Mesh) -> Layout:
+def layout(mesh: UnwrappedMesh) -> Layout:
     """Measure how good the uv layout of a mesh is."""
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2

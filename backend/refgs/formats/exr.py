@@ -76,7 +76,8 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
         with OpenEXR.File(str(path), header_only=True) as file:
             windows = [np.array(part.header["dataWindow"]) for part in file.parts]
         for low, high in windows:  # every part is decoded
-            check_pixels(path, *(high - low + 1).tolist(), *_FEWEST)
+            width, height = (high - low + 1).tolist()
+            check_pixels(path, width, height, *_FEWEST)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             parts = [file.channels(i) for i in range(len(file.parts))]
             part = next((part for part in parts if {"R", "G", "B"} <= part.keys()), parts[0])

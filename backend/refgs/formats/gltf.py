@@ -2,14 +2,16 @@
 
 import os
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import trimesh
 from PIL import Image
+from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from refgs.errors import InputError, reason
-from refgs.formats.mesh import Y_UP, Mesh, check_mesh
+from refgs.formats.mesh import Y_UP, Mesh, UnwrappedMesh, check_mesh
 from refgs.formats.tangents import vertex_tangents
 from refgs.formats.textures import FOLDER, Textures, write_textures
 from refgs.paths import whole
@@ -17,7 +19,7 @@ from refgs.paths import whole
 SPECULAR = "KHR_materials_specular"
 
 
-def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
+def write_glb(path: str | os.PathLike, mesh: UnwrappedMesh, textures: Textures) -> None:
     """Write a textured mesh as a binary glTF file. The mesh is turned from Z up to glTF's Y up.
 
     The file has one metallic-roughness material. These are stored in the file:
@@ -28,7 +30,7 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
     - the MikkTSpace tangents that the normal map was made with. Some programs do not compute them.
     - the extension KHR_materials_specular, only if specular reflection must be turned off
 
-    The maps are also written as files beside the mesh, by `write_textures`. `mesh` must have normals and uv.
+    The maps are also written as files beside the mesh, by `write_textures`.
     """
     path = Path(path)
     pictures = write_textures(path.parent / FOLDER, textures)
@@ -47,7 +49,7 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
         mesh.vertices @ Y_UP.T,
         mesh.faces,
         vertex_normals=mesh.normals @ Y_UP.T,
-        visual=trimesh.visual.TextureVisuals(uv=mesh.uv, material=material),
+        visual=TextureVisuals(uv=mesh.uv, material=material),
         process=False,
     )
     tangents, signs = vertex_tangents(mesh)
@@ -64,7 +66,8 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
     scene = trimesh.Scene()
     scene.add_geometry(model, node_name="RefGS", geom_name="RefGS")
     with whole(path) as temporary:
-        temporary.write_bytes(scene.export(file_type="glb", include_normals=True, tree_postprocessor=finish))
+        data = scene.export(file_type="glb", include_normals=True, tree_postprocessor=finish)
+        temporary.write_bytes(cast(bytes, data))
 
 
 def read_glb(path: str | os.PathLike) -> Mesh:

@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
+from typing_extensions import TypedDict
 
 from refgs.paths import read_bytes
 
@@ -12,12 +13,12 @@ FILE = "history.jsonl"  # in the run folder
 _Number = Annotated[int, Field(ge=-(2**53), le=2**53)] | float | None
 
 
-class _Line(BaseModel):
-    model_config = ConfigDict(extra="allow", strict=True)
-    __pydantic_extra__: dict[str, _Number]
+class _Line(TypedDict, total=False, extra_items=_Number):
+    iteration: _Number
+    parts: dict[str, _Number]
 
-    iteration: _Number = None
-    parts: dict[str, _Number] = {}
+
+_LINE = TypeAdapter(_Line)
 
 
 def read(file: Path) -> tuple[list[dict], int]:
@@ -30,7 +31,7 @@ def read(file: Path) -> tuple[list[dict], int]:
     for line in read_bytes(file).split(b"\n"):
         if line.strip():
             try:
-                found.append(_Line.model_validate_json(line).model_dump(exclude_unset=True))
+                found.append(_LINE.validate_json(line, strict=True))
             except ValidationError:
                 damaged += 1
     return found, damaged

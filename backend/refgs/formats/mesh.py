@@ -3,6 +3,7 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import trimesh
@@ -21,24 +22,35 @@ class Mesh:
 
     - vertices (V, 3): float64, in world units
     - faces (F, 3): vertex indices, counter-clockwise as seen from outside
-    - normals (V, 3), optional: smooth unit normals
-    - uv (V, 2), optional: in 0..1, with v upward
     """
 
     vertices: np.ndarray
     faces: np.ndarray
-    normals: np.ndarray | None = None
-    uv: np.ndarray | None = None
 
-    @classmethod
-    def empty(cls) -> "Mesh":
-        return cls(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    @staticmethod
+    def empty() -> "Mesh":
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+
+
+@dataclass
+class SmoothMesh(Mesh):
+    """Hold a triangle mesh with smooth unit normals (V, 3)."""
+
+    normals: np.ndarray
+
+
+@dataclass
+class UnwrappedMesh(SmoothMesh):
+    """Hold a smooth triangle mesh with texture coordinates `uv` (V, 2), in 0..1, with v upward."""
+
+    uv: np.ndarray
 
 
 def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
     """Write a mesh's vertices and faces as a binary PLY file. A failed write leaves no partial file."""
     with whole(path) as temporary:
-        temporary.write_bytes(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="ply"))
+        data = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="ply")
+        temporary.write_bytes(cast(bytes, data))
 
 
 def read_mesh(path: str | os.PathLike) -> Mesh:

@@ -3,26 +3,23 @@
 from pathlib import Path
 from typing import Any
 
-from pydantic import ConfigDict, Field, JsonValue
+from pydantic import Field, JsonValue, RootModel
 
-from refgs.formats.validate import Model, parse_json, validated
-from refgs.paths import read_text
+from refgs.formats.validate import Model, read_json, validated
+
+
+class _Figures(RootModel[dict[str, JsonValue]]):
+    pass
 
 
 class Said(Model):
     """Hold words for the user about what was measured, if there are any."""
 
-    model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, JsonValue]
-
     what: str | None = None
 
 
 class Metrics(Model):
-    """Hold a metrics.json: `ambiguities` and `doubt` are what photos cannot tell apart; all else are figures."""
-
-    model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, JsonValue]
+    """Hold what metrics.json has besides figures: `ambiguities` and `doubt` are what photos cannot tell apart."""
 
     ambiguities: dict[str, Said] = Field(default_factory=dict)
     doubt: Said | None = None
@@ -35,5 +32,5 @@ class Metrics(Model):
 def read_metrics(file: Path) -> tuple[dict[str, Any], Metrics]:
     """Read a metrics.json as nested dicts, and what is known of it. Raises InputError naming the file and the value that is wrong."""
     again = "Remove it, and evaluate the run again."
-    found = parse_json(read_text(file, again), str(file), again)
+    found = read_json(file, _Figures, again).root
     return found, validated(found, Metrics, str(file), again)

@@ -5,16 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
-from refgs.formats.mesh import Y_UP, Mesh
+from refgs.formats.mesh import Y_UP, UnwrappedMesh
 from refgs.formats.textures import FOLDER, Textures, write_textures
 from refgs.paths import whole
 
 
-def write_obj(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
+def write_obj(path: str | os.PathLike, mesh: UnwrappedMesh, textures: Textures) -> None:
     """Write a textured mesh as a Wavefront OBJ file, with its material in an MTL file. The mesh is turned from Z up to Y up.
 
     The material names the pictures that `write_textures` writes beside it. Its keys are the usual ones for PBR: map_Kd (base colour),
-    map_Pm (metallic), map_Pr (roughness) and norm. `mesh` must have normals and uv.
+    map_Pm (metallic), map_Pr (roughness) and norm.
     """
     path = Path(path)
     write_textures(path.parent / FOLDER, textures)

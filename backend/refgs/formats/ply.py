@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from plyfile import PlyData, PlyElement, PlyParseError
@@ -35,7 +36,7 @@ def read_ply(path: str | os.PathLike) -> PlyData:
         raise InputError(f"{path} is not a whole PLY file ({error}): copy or export it again") from None
 
 
-def write_ply(path: str | os.PathLike, elements: list[PlyElement], comments: list[str] = ()) -> None:
+def write_ply(path: str | os.PathLike, elements: list[PlyElement], comments: Sequence[str] = ()) -> None:
     """Write a binary little-endian PLY file. A failed write leaves no partial file."""
     with whole(path) as temporary:
         PlyData(elements, byte_order="<", comments=list(comments)).write(str(temporary))

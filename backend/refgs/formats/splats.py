@@ -7,6 +7,7 @@ import math
 import os
 import re
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -135,7 +136,7 @@ def _write(
     names: list[str],
     columns: list[np.ndarray],
     others: tuple[PlyElement, ...] = (),
-    comments: list[str] = (),
+    comments: Sequence[str] = (),
 ) -> None:
     count = len(columns[0])
     table = np.empty((count, len(names)), "<f4")

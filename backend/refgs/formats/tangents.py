@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from refgs.formats.mesh import Mesh
+from refgs.formats.mesh import UnwrappedMesh
 
 
-def vertex_tangents(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+def vertex_tangents(mesh: UnwrappedMesh) -> tuple[np.ndarray, np.ndarray]:
     """Compute a unit tangent (V, 3) and a sign (V,) for each vertex, such that bitangent = sign · normal × tangent.
 
     Tangents point along increasing u. A vertex's tangent is the mean of its faces' tangents. Each is projected to the plane of the vertex's

@@ -57,16 +57,8 @@ class Frame(Intrinsics):
         return self
 
 
-class Transforms(Model):
-    """Hold the cameras of a file, and what nerfstudio and instant-ngp say besides. Values that all frames share are in each frame."""
-
-    frames: list[Frame]
-    train_filenames: list[str] | None = None
-    test_filenames: list[str] | None = None
-    val_filenames: list[str] | None = None
-    ply_file_path: str | None = None
-    aabb_scale: Any = None
-    to_capture: Matrix | None = None  # of a run's cameras.json: from the run's frame to the capture's
+class _Cameras(Model):
+    """Hold the `frames` of a file. Values that all frames share are in each frame."""
 
     @model_validator(mode="before")
     @classmethod
@@ -77,6 +69,18 @@ class Transforms(Model):
         shared = {key: data[key] for key in Intrinsics.model_fields if key in data}
         frames = [{**shared, **frame} if isinstance(frame, dict) else frame for frame in data["frames"]]
         return {**data, "frames": frames}
+
+
+class Transforms(_Cameras):
+    """Hold the cameras of a file, and what nerfstudio and instant-ngp say besides."""
+
+    frames: list[Frame]
+    train_filenames: list[str] | None = None
+    test_filenames: list[str] | None = None
+    val_filenames: list[str] | None = None
+    ply_file_path: str | None = None
+    aabb_scale: Any = None
+    to_capture: Matrix | None = None  # of a run's cameras.json: from the run's frame to the capture's
 
     @property
     def of_instant_ngp(self) -> bool:
@@ -92,7 +96,7 @@ class RunFrame(Frame):
     refined: bool = False
 
 
-class RunCameras(Transforms):
+class RunCameras(_Cameras):
     """Hold the cameras of a run, in the run's frame."""
 
     frames: list[RunFrame]
@@ -105,7 +109,7 @@ class NovelFrame(Frame):
     scene_name: str
 
 
-class NovelCameras(Transforms):
+class NovelCameras(_Cameras):
     """Hold a transforms_novel.json of Stanford-ORB."""
 
     frames: list[NovelFrame]

@@ -34,7 +34,7 @@ def carve_hollows(alpha: np.ndarray, low: np.ndarray, voxel: np.ndarray, photos:
         unsure = minimum_filter(touched, 3) > LONG * shape.ball[1]
         left -= _empty(cells, depth_maps(photos, shape, unsure), max(PHOTOS[0] * len(photos), PHOTOS[1]))
     scale = [n / cells for n, cells in zip(alpha.shape, left.shape, strict=True)]
-    return zoom(gaussian_filter(left, SMOOTH), scale, order=1, mode="nearest", grid_mode=True)
+    return np.asarray(zoom(gaussian_filter(left, SMOOTH), scale, order=1, mode="nearest", grid_mode=True))
 
 
 def _empty(shape: Shape, maps: Sequence[DepthMap], least: float) -> np.ndarray:

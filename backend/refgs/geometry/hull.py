@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 from skimage.measure import marching_cubes
 
 from refgs.camera import Camera
 from refgs.errors import InputError
-from refgs.kernels.layout import struct
+from refgs.kernels.layout import Work, struct
 from refgs.kernels.load import kernels, parallel
 
 # Part of the object that a single view may remove against all the others: above it, the view's mask is bad. True masks of a sphere
@@ -121,7 +121,7 @@ _Silhouette = struct("Silhouette", "carve.cpp")
 _Work = struct("Carve", "carve.cpp")
 
 
-def _silhouette(mask: np.ndarray, camera: Camera, low: np.ndarray, voxel: np.ndarray) -> _Silhouette:
+def _silhouette(mask: np.ndarray, camera: Camera, low: np.ndarray, voxel: np.ndarray) -> Work:
     height, width = mask.shape
     matrix = camera.resized(width, height).projection
     # A mask clear of the picture's border shows the whole object: space outside the picture is empty. Otherwise it is unknown.

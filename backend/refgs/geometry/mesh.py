@@ -5,14 +5,14 @@ import numpy as np
 import trimesh
 
 from refgs.errors import InputError
-from refgs.formats.mesh import Mesh
+from refgs.formats.mesh import Mesh, SmoothMesh
 
 KEEP = 0.01  # of the largest part's area: smaller parts are crumbs. the largest crumb of four real captures has 0.006
 HOLE = 32  # edges around a small hole, about seven voxels across
 FRAY = 2  # rings of faces, from a border inwards: what is nowhere farther from the border frays out
 
 
-def clean(mesh: Mesh, triangles: int) -> Mesh:
+def clean(mesh: Mesh, triangles: int) -> SmoothMesh:
     """Clean up a mesh, simplify it to about `triangles` faces if it has more, and compute smooth normals.
 
     - Crumbs are removed: connected parts with less than KEEP times the largest part's area.
@@ -40,10 +40,11 @@ def clean(mesh: Mesh, triangles: int) -> Mesh:
     if len(work.faces) > triangles:
         # Take the gentlest setting that reaches the budget. On a sphere, normals are off by 0.1° with 3, and by 0.5° with 7, the
         # library's default, at some vertices by 30°. On a very noisy mesh 3 stops early.
+        vertices, faces = work.vertices, work.faces
         for aggressiveness in (3, 5, 7):
             vertices, faces = fast_simplification.simplify(
                 work.vertices, work.faces, target_count=triangles, agg=aggressiveness
-            )
+            )[:2]
             if len(faces) <= triangles:
                 break
         work = trimesh.Trimesh(vertices, faces, process=False)
@@ -53,7 +54,7 @@ def clean(mesh: Mesh, triangles: int) -> Mesh:
     used, faces = np.unique(work.faces, return_inverse=True)
     vertices = np.asarray(work.vertices)[used]
     faces = faces.reshape(-1, 3)
-    return Mesh(vertices, faces, smooth_normals(vertices, faces))
+    return SmoothMesh(vertices, faces, smooth_normals(vertices, faces))
 
 
 def _large(mesh: trimesh.Trimesh) -> np.ndarray:

@@ -40,8 +40,23 @@ def sample(image: np.ndarray, pixels: np.ndarray, clamp: bool = False) -> np.nda
     np.clip(pixels - np.float32(0.5), -10, 32000, out=maps[:count])
     maps = maps.reshape(rows, _ROW, 2)
     border = cv2.BORDER_REPLICATE if clamp else cv2.BORDER_CONSTANT
-    values = cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=border, borderValue=0)
+    values = remap(image, maps, border=border)
     return values.reshape(rows * _ROW, *image.shape[2:])[:count]
+
+
+def remap(
+    image: np.ndarray,
+    at: np.ndarray,
+    interpolation: int = cv2.INTER_LINEAR,
+    border: int = cv2.BORDER_CONSTANT,
+    outside: float = 0.0,
+) -> np.ndarray:
+    """Interpolate an image at columns and rows `at` (H, W, 2) float32, by OpenCV's `remap`. Returns (H, W) or (H, W, C).
+
+    The centre of the first pixel is at (0, 0). `outside` is the first channel's value outside the image.
+    """
+    one_map = np.empty(0, np.float32)  # in place of a second map: `at` has both coordinates
+    return cv2.remap(image, at, one_map, interpolation, borderMode=border, borderValue=(outside,))
 
 
 def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:

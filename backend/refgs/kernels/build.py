@@ -144,7 +144,7 @@ def _compile(target: Target, library: Path) -> None:
             text=True,
             errors="replace",
         ) as compiler:
-            said = compiler.stdout.read()
+            said = "".join(compiler.stdout or ())
         if compiler.returncode != 0:
             raise RuntimeError(f"compiling the kernels for {target} failed:\n{said}")
         os.replace(made, library)

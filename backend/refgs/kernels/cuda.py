@@ -11,6 +11,7 @@ import os
 import re
 import warnings
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -63,7 +64,7 @@ class CardError(RuntimeError):
     """Error of a CUDA card that cannot go on: it was lost, or what it ran went wrong."""
 
 
-def _check(result: tuple, what: str):
+def _check(result: tuple, what: str) -> Any:
     """Raise an error if a CUDA call failed; the message begins with `what`. Return the call's results without the status."""
     status, *values = result
     if status.name == "CUDA_ERROR_OUT_OF_MEMORY":
@@ -76,7 +77,7 @@ def _check(result: tuple, what: str):
 
 def compile_source(source: str, architecture: str) -> bytes:
     """Compile a kernel source file to machine code (cubin) for an architecture such as "sm_86". No card is needed."""
-    from cuda.bindings import nvrtc
+    import cuda.bindings.nvrtc as nvrtc
 
     headers = [(HERE / name).read_bytes() for name in HEADERS]
     names = [name.encode() for name in HEADERS]
@@ -99,7 +100,7 @@ def cubin(source: str, architecture: str, cache: Path) -> bytes:
 
     The name of the cached file has a hash of everything that the machine code depends on.
     """
-    from cuda.bindings import nvrtc
+    import cuda.bindings.nvrtc as nvrtc
 
     parts = [(HERE / name).read_bytes() for name in (source, *HEADERS)]
     digest = hashlib.sha256(repr((OPTIONS, _check(nvrtc.nvrtcVersion(), source), parts)).encode()).hexdigest()[:16]
@@ -118,7 +119,7 @@ def cubin(source: str, architecture: str, cache: Path) -> bytes:
 @functools.cache
 def _module(source: str, device: int):
     """Load all kernels of a source file on a card, in the CUDA context that torch uses."""
-    from cuda.bindings import driver
+    import cuda.bindings.driver as driver
 
     major, minor = torch.cuda.get_device_capability(device)
     torch.cuda.set_device(device)
@@ -127,7 +128,7 @@ def _module(source: str, device: int):
 
 @functools.cache
 def _function(name: str, device: int):
-    from cuda.bindings import driver
+    import cuda.bindings.driver as driver
 
     return _check(driver.cuModuleGetFunction(_module(KERNELS[name], device), name.encode()), name)
 
@@ -137,7 +138,7 @@ def launch(name: str, work: ctypes.Structure, device: torch.device, blocks: int,
 
     `work` holds the kernel's arguments. The tensors that it points at must exist until the kernel is done.
     """
-    from cuda.bindings import driver
+    import cuda.bindings.driver as driver
 
     # Autograd's own threads have no context until they ask for one, and `torch.cuda.device` asks only if the device changes.
     torch.cuda.set_device(device)

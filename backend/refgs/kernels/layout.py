@@ -6,6 +6,7 @@ Each struct is declared in one place only.
 import ctypes
 import functools
 import re
+from typing import cast
 
 import torch
 
@@ -60,11 +61,12 @@ def _made(name: str, source: str) -> type[Work] | None:
     base, body = found.groups()
     constants, fields = dict(re.findall(r"\b(\w+) = (\d+)[,;]", text)), []
     for statement in body.split(";")[:-1]:
-        kind, declarators = re.fullmatch(r"\s*(?:mutable )?(?:const )?(\w*)(.*)", statement, re.DOTALL).groups()
+        [(kind, declarators)] = re.findall(r"\A\s*(?:mutable )?(?:const )?(\w*)(.*)", statement, re.DOTALL)
         for declarator in declarators.split(","):
             if not (parts := re.fullmatch(r"\s*(\*?)\s*(\w+)(?:\[(\w+)\])?", declarator)):
                 raise ValueError(f"{source}: struct {name}: cannot read the field '{' '.join(statement.split())}'")
             pointer, field, length = parts.groups()
             type_ = ctypes.c_void_p if pointer else NUMBERS.get(kind) or struct(kind, source)
             fields.append((field, type_ * int(constants.get(length, length)) if length else type_))
-    return type(name, (struct(base, source) if base else Work,), {"_fields_": fields})
+    made = type(name, (struct(base, source) if base else Work,), {"_fields_": fields})
+    return cast(type[Work], made)

@@ -136,7 +136,7 @@ def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0, most:
     if threads == 1:
         function(ctypes.byref(work))
     elif openmp := _openmp():
-        openmp(ctypes.cast(function, ctypes.c_void_p), ctypes.addressof(work), threads, 0)
+        openmp(function, ctypes.addressof(work), threads, 0)
     else:
         list(_pool(threads).map(lambda _: function(ctypes.byref(work)), range(threads)))
 

@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.clock import timed
+from refgs.kernels.function import Function
 from refgs.kernels.layout import struct
 from refgs.kernels.load import check, run
 from refgs.model import cubemap
@@ -171,7 +172,8 @@ def matrices(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
         parts.append((orbit, start + texel, weight))
         start += 6 * side * side
     shape = sum(n * n // 4 for n in _pyramid_sides(resolution)), start // SYMMETRIES
-    transpose, matrix = _matrix_and_transpose(shape, *(np.concatenate(p) for p in zip(*parts, strict=True)), device)
+    orbit, texel, weight = (np.concatenate(column) for column in zip(*parts, strict=True))
+    transpose, matrix = _matrix_and_transpose(shape, orbit, texel, weight, device)
     return matrix, transpose
 
 
@@ -191,8 +193,9 @@ def _pyramid(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
         parent = texel // half // 2 * quarter + texel % half // 2
         mip = sparse.csr_matrix((share, (parent, texel))) @ mip
         mips.append(mip)
-    matrix = sparse.vstack(mips, format="coo")
-    return _matrix_and_transpose(matrix.shape, matrix.row, SYMMETRIES * matrix.col, matrix.data, device)
+    matrix = sparse.coo_matrix(sparse.vstack(mips))
+    shape = sum(side * side // 4 for side in _pyramid_sides(resolution)), resolution**2 // 4
+    return _matrix_and_transpose(shape, matrix.row, SYMMETRIES * matrix.col, matrix.data, device)
 
 
 @lru_cache(maxsize=4)
@@ -216,7 +219,7 @@ def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tenso
 
 
 @timed("prefilter")
-class _Prefilter(torch.autograd.Function):
+class _Prefilter(Function):
     @staticmethod
     def forward(ctx, radiance: Tensor, resolution: int) -> Tensor:
         ctx.resolution, device = resolution, radiance.device

@@ -1,7 +1,7 @@
 """Represent surfels by raw parameters, which are learned, and by the values after the activation functions, which are rendered."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from refgs.clock import timed
 from refgs.formats.splats import Splats
+from refgs.kernels.function import Function
 from refgs.kernels.layout import struct
 from refgs.kernels.load import run
 from refgs.model import harmonics
@@ -86,7 +87,7 @@ _Work = struct("Activate", "activate.cpp")
 
 
 @timed("surfels")
-class _Activate(torch.autograd.Function):
+class _Activate(Function):
     @staticmethod
     def forward(ctx, *raw):
         raw = [tensor.contiguous() for tensor in raw]
@@ -104,14 +105,16 @@ class _Activate(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, *by_values):
         raw, values = ctx.saved_tensors[: len(by_values)], ctx.saved_tensors[len(by_values) :]
-        work, by_raw = _Work(), [None] * len(by_values)
+        work, by_raw = (
+            _Work(),
+            [torch.empty_like(v) if n else None for v, n in zip(values, ctx.needs_input_grad, strict=True)],
+        )
         by_values = [by.contiguous() for by in by_values]
-        for i, kind in enumerate(_KINDS.values()):
-            if ctx.needs_input_grad[i]:
-                by_raw[i] = torch.empty_like(values[i])
+        for kind, r, value, by_value, by in zip(_KINDS.values(), raw, values, by_values, by_raw, strict=True):
+            if by is not None:
                 slot = work.activations[work.tensors]
-                slot.count, slot.kind = by_raw[i].numel(), kind
-                slot.attach(raw=raw[i], value=values[i], by_value=by_values[i], by_raw=by_raw[i])
+                slot.count, slot.kind = by.numel(), kind
+                slot.attach(raw=r, value=value, by_value=by_value, by_raw=by)
                 work.tensors += 1
         run("refgs_activate_backward", work, values[0], items=sum(value.numel() for value in values))
         return tuple(by_raw)
@@ -207,7 +210,8 @@ def to_splats(surfels: Surfels) -> Splats:
         values["rotations"] = torch.nn.functional.normalize(surfels.rotations, dim=-1)
         for name in ("sh", "indirect"):
             values[name] = torch.cat([values.pop(f"{name}_dc"), values.pop(f"{name}_rest")], dim=1)
-        return Splats(**{name: value.numpy(force=True) for name, value in values.items()})
+        arrays: dict[str, Any] = {name: value.numpy(force=True) for name, value in values.items()}
+        return Splats(**arrays)
 
 
 def from_splats(splats: Splats) -> Surfels:

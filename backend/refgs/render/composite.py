@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 from torch import Tensor
 
 from refgs.formats.splats import Splats
@@ -49,8 +49,8 @@ def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress:
     with torch.no_grad():
         for start in range(0, len(points), _CHUNK):
             at = slice(start, start + _CHUNK)
-            given = (torch.from_numpy(np.asarray(x[at], np.float32)) for x in (points, normals))
-            result[at] = _blend(table, values, torch.from_numpy(near[cell[at]]), *given, spread).numpy()
+            place, normal = (torch.from_numpy(np.asarray(x[at], np.float32)) for x in (points, normals))
+            result[at] = _blend(table, values, torch.from_numpy(near[cell[at]]), place, normal, spread).numpy()
             progress(min(start + _CHUNK, len(points)), len(points))
     return result
 

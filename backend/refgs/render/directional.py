@@ -6,6 +6,7 @@ from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
 from refgs.clock import timed
+from refgs.kernels.function import Function
 from refgs.kernels.layout import struct
 from refgs.kernels.load import run
 
@@ -13,7 +14,7 @@ _Work = struct("Harmonics", "harmonics.cpp")
 
 
 @timed("surfels")
-class _Directional(torch.autograd.Function):
+class _Directional(Function):
     @staticmethod
     def forward(ctx, constant, rest, offset, positions, normals, camera):
         inputs = {"constant": constant.contiguous(), "rest": rest.contiguous(), "positions": positions.contiguous()}

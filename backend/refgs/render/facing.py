@@ -6,6 +6,7 @@ from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
 from refgs.clock import timed
+from refgs.kernels.function import Function
 from refgs.kernels.layout import struct
 from refgs.kernels.load import check, run
 
@@ -13,7 +14,7 @@ _Work = struct("Normals", "normals.cpp")
 
 
 @timed("surfels")
-class _Facing(torch.autograd.Function):
+class _Facing(Function):
     @staticmethod
     def forward(ctx, rotations, positions, camera):
         inputs = {"rotations": rotations.contiguous(), "positions": positions.contiguous()}

@@ -1,5 +1,8 @@
 """Hold what the rasterisers for the CPU and for CUDA cards have in common."""
 
+import ctypes
+from collections.abc import Callable
+
 from torch import Tensor
 
 from refgs.camera import Camera
@@ -11,6 +14,9 @@ class Scene:
     This is a mixin. Each rasteriser has a class `Raster` that derives from its C struct of arguments and from `Scene`. It adds three
     methods, called in this order: `project` finds the splats of each tile, `blend` draws them, `differentiate` computes the gradients.
     """
+
+    view: ctypes.Array
+    attach: Callable[..., None]  # as `Work` has it
 
     def look(self, camera: Camera, near: float, upper: float = 1.0, lower: float = 0.0) -> None:
         self.width, self.height = camera.width, camera.height

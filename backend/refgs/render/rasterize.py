@@ -9,6 +9,7 @@ from torch.autograd.function import once_differentiable
 from refgs.camera import Camera
 from refgs.clock import timed
 from refgs.kernels import load
+from refgs.kernels.function import Function
 from refgs.render import raster_cpu, raster_cuda
 from refgs.render.raster import Scene
 
@@ -52,7 +53,7 @@ def _draw(splats: dict[str, Tensor], camera: Camera, near: float, *trim: float) 
 
 
 @timed("raster")
-class _Rasterize(torch.autograd.Function):
+class _Rasterize(Function):
     @staticmethod
     def forward(ctx, positions, rotations, scales, opacities, features, camera, near):
         inputs = {

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from scipy import sparse
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 from torch import Tensor
 
 from refgs.geometry.mesh import smooth_normals

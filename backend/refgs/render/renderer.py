@@ -76,10 +76,13 @@ def render(
     method = method_of(settings)
     if method.draw is not None:
         return method.draw(surfels, environment, camera, background, settings, near, occluder, exposure)
+    if environment is None:
+        raise ValueError("there is no light to shade with")
     matte = settings.reflection == "none"
     occluder = None if matte else occluder
     blended = channels(surfels, camera, settings, indirect=occluder is not None)
     has_residual = settings.diffuse == "irradiance" and surfels.sh_rest.shape[1] > 0
+    residual = None
     if has_residual:
         none = torch.zeros_like(surfels.sh_dc)
         blended = [directional(none, surfels.sh_rest, SIGNED, surfels.positions, camera), *blended]
@@ -89,5 +92,5 @@ def render(
     visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
     how = method.light.display, method.mirror, settings.diffuse == "sh", matte
     shaded = shade(features, alpha, environment, camera, background, visibility, exposure, *how)
-    color = shaded.color + (residual - SIGNED * alpha[..., None]) if has_residual else shaded.color
+    color = shaded.color if residual is None else shaded.color + (residual - SIGNED * alpha[..., None])
     return Rendering(color, alpha, depth, shaded.normal, shaded.material, visibility, background, exposure)

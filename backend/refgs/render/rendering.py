@@ -22,7 +22,7 @@ class Rendering:
     - `material` (H, W, 5): albedo (linear), metallic, roughness; None without a light
     - `visibility` (H, W): 0 where the object occludes the mirror direction, else 1; None without inter-reflection
 
-    `background` (3,) and `exposure` (3,) are the arguments of `render`.
+    `background` (3,) and `exposure` (3,) are the arguments of `render`; without them, the background is black and the exposure 1.
     """
 
     color: Tensor
@@ -31,7 +31,7 @@ class Rendering:
     normal: Tensor
     material: Tensor | None = None
     visibility: Tensor | None = None
-    background: Tensor | None = None
+    background: Tensor | float = 0.0
     exposure: Tensor | None = None
 
     @property
@@ -48,12 +48,18 @@ class Rendering:
 
     @property
     def albedo(self) -> Tensor:
-        return self.material[..., :3]
+        return self._known_material[..., :3]
 
     @property
     def metallic(self) -> Tensor:
-        return self.material[..., 3]
+        return self._known_material[..., 3]
 
     @property
     def roughness(self) -> Tensor:
-        return self.material[..., 4]
+        return self._known_material[..., 4]
+
+    @property
+    def _known_material(self) -> Tensor:
+        if self.material is None:
+            raise ValueError("a rendering without a light has no material")
+        return self.material

@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 from refgs.camera import Camera
 from refgs.clock import timed
 from refgs.kernels import cuda, load
+from refgs.kernels.function import Function
 from refgs.kernels.layout import struct
 from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
@@ -76,8 +77,8 @@ class _Padding(NamedTuple):
         texel = cubemap.orbit_order(sides).argsort()[texel]
         lines = [6 * (side + 2) for side in sides]
         starts = torch.nn.functional.pad(texel.bincount().cumsum(dim=0), (1, 0))
-        tables = (t.to(device, torch.int32) for t in (texel, starts, texel.argsort(stable=True)))
-        return cls(*tables, first_cells.tolist(), [sum(lines[:k]) for k in range(len(lines))], sum(lines))
+        texel, starts, cell = (t.to(device, torch.int32) for t in (texel, starts, texel.argsort(stable=True)))
+        return cls(texel, starts, cell, first_cells.tolist(), [sum(lines[:k]) for k in range(len(lines))], sum(lines))
 
 
 @lru_cache(maxsize=4)
@@ -91,7 +92,7 @@ def _one(device: torch.device) -> Tensor:
 
 
 @timed("shading")
-class _Shade(torch.autograd.Function):
+class _Shade(Function):
     @staticmethod
     def forward(ctx, features, alpha, levels, exposure, sides, camera, turn, background, visibility, *how):
         features, alpha = features.contiguous(), alpha.contiguous()

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.clock import timed
+from refgs.kernels.function import Function
 from refgs.kernels.layout import struct
 from refgs.kernels.load import check, run
 
@@ -22,7 +22,7 @@ class _Work(struct("Stack", "stack.cpp")):
 
 
 @timed("surfels")
-class _Stack(torch.autograd.Function):
+class _Stack(Function):
     @staticmethod
     def forward(ctx, *parts):
         ctx.widths = [part.shape[1:].numel() for part in parts]

@@ -5,6 +5,8 @@ the ellipse that the Gaussian covers in the picture. The disc covers the same el
 right angles to the camera's axis. The rasteriser draws such discs exactly.
 """
 
+from typing import cast
+
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -12,6 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
 from refgs.clock import timed
+from refgs.kernels.function import Function
 from refgs.model.surfels import Surfels, axes
 
 SIDE = 1.3  # half pictures from the centre; the projection's derivative, which grows without bound, is clamped there
@@ -54,7 +57,7 @@ def with_normals_last(surfels: Surfels) -> Surfels:
 
 
 @timed("surfels")
-class _HalfAngle(torch.autograd.Function):
+class _HalfAngle(Function):
     """Compute atan2(y, x) / 2, with a derivative that fades to zero near the origin, where the angle is undefined.
 
     Near means that x and y are tiny compared with `size`.
@@ -104,7 +107,7 @@ def across_the_axis(positions: Tensor, rotations: Tensor, scales: Tensor, camera
     for column, scale in zip(columns, scales.unbind(-1), strict=True):
         a = [scale * sum(view[i][j] * column[j] for j in range(3)) for i in range(3)]
         moves.append((a[0] - slope[0] * a[2], a[1] - slope[1] * a[2]))
-    xx, xy, yy = (sum(m[i] * m[j] for m in moves) for i, j in ((0, 0), (0, 1), (1, 1)))
+    xx, xy, yy = (cast(Tensor, sum(m[i] * m[j] for m in moves)) for i, j in ((0, 0), (0, 1), (1, 1)))
     middle, apart = (xx + yy) / 2, (xx - yy) / 2
     half = torch.sqrt(apart * apart + xy * xy + 1e-12 * middle * middle)
     variances = torch.stack([middle + half, (middle - half).clamp_min(1e-9 * middle.detach())], dim=-1)

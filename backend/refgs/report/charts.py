@@ -74,7 +74,7 @@ def error_chart(groups: list[list[Curve]], runs: list[str]) -> str:
             _draw_errors(axes, curves, runs)
         for axes in grid[len(groups) :]:
             axes.axis("off")
-        handles = {line.get_label(): line for axes in figure.axes for line in axes.lines}
+        handles = {str(line.get_label()): line for axes in figure.axes for line in axes.lines}
         handles = dict(sorted(handles.items(), key=lambda item: item[0] not in runs))  # runs come first
         figure.legend(handles.values(), handles, loc="outside upper left", ncols=beside, frameon=False, fontsize=9)
     return made[0]

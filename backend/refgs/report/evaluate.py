@@ -74,9 +74,10 @@ def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None,
     found = {"lpips": None} | found | {"lpips_reason": without_lpips}
     if lit:
         found |= _measure_light(run, truth, pictures)
-    for hdri in hdris:
-        figures = _measure_relit(run, hdri, cameras, truth, pictures / "relight", next_step)
-        found.setdefault("relight", {})[hdri] = {"refgs": figures}
+    if truth:
+        for hdri in hdris:
+            figures = _measure_relit(run, hdri, cameras, truth, pictures / "relight", next_step)
+            found.setdefault("relight", {})[hdri] = {"refgs": figures}
     if by_protocol:
         found |= published.measure(run, views, truth, pictures / "relight", next_step)
     if truth and truth.has_mesh and (run.folder / "mesh.glb").exists():

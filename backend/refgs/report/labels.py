@@ -59,7 +59,7 @@ def _words(key: str, short: str, value: Hashable) -> str:
 
 def _settings(summary: Summary) -> dict[str, Hashable]:
     """Collect the values by which a label can tell runs apart: {"section.setting": value}."""
-    found = {f"run.{key}": value for key, value in summary.run.items() if f"run.{key}" in BY_NAME}
+    found: dict[str, Hashable] = {f"run.{key}": value for key, value in summary.run.items() if f"run.{key}" in BY_NAME}
     for name in ("run.capture", "run.preset"):  # only the last part of a path
         if name in found:
             found[name] = str(found[name]).replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]

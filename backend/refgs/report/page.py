@@ -241,7 +241,8 @@ def _embed(path: Path) -> str:
     if scale >= 1:
         data = path.read_bytes()
     else:
-        data = cv2.imencode(".png", cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))[1]
+        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        data = cv2.imencode(".png", small)[1].tobytes()
     return "data:image/png;base64," + base64.b64encode(data).decode()
 
 

@@ -39,8 +39,8 @@ def start_parameters(
         source = "the visual hull of the masks" + (", less what photos see through" if hollows else "")
     else:
         opacity = min(opacity, FAINT)
-        if _has_points(capture):
-            positions, colours = _thinned(capture, count, seed)
+        if capture.points is not None and _enough(capture.points, capture.box):
+            positions, colours = _thinned(capture.points, capture, count, seed)
             source = f"{len(positions)} structure-from-motion points"
         else:
             positions = _random_points(capture, count, seed)
@@ -77,10 +77,9 @@ def _hull_points(capture: Capture, views: list[LoadedView], count: int, settings
 
     Returns positions, normals, the spacing of the points, and how many are on the hull. These come first.
     """
-    alphas, cameras = [view.alpha for view in views], [view.camera for view in views]
-    surfels, seed = settings.surfels, settings.train.seed
-
-    photos = [Photo(view.image, view.alpha, view.camera, view.white) for view in views]
+    surfels, seed, cameras = settings.surfels, settings.train.seed, [view.camera for view in views]
+    photos = [Photo(view.image, view.alpha, view.camera, view.white) for view in views if view.alpha is not None]
+    alphas = [photo.alpha for photo in photos]  # all views have one
     carve = partial(carve_hollows, photos=photos) if hollows else None
 
     def within(radius: float) -> tuple:
@@ -122,15 +121,14 @@ def _in_and_around(
     return np.sort(rng.permutation(inner)[: count - len(outer)]), np.sort(outer)
 
 
-def _has_points(capture: Capture) -> bool:
+def _enough(points: np.ndarray, box: Box | None) -> bool:
     """Tell whether structure from motion found at least 100 points in the region to train, enough for surfels to start at."""
-    if capture.points is None:
-        return False
-    return len(capture.points if capture.box is None else capture.points[capture.box.contains(capture.points)]) >= 100
+    return len(points if box is None else points[box.contains(points)]) >= 100
 
 
-def _thinned(capture: Capture, count: int, seed: int):
-    points, colours, chosen = capture.points, capture.point_colors, slice(None)
+def _thinned(points: np.ndarray, capture: Capture, count: int, seed: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Choose at most `count` of the `points` (N, 3). Returns them, and their colours if these are known."""
+    colours, chosen = capture.point_colors, slice(None)
     if capture.box is not None:
         chosen = np.concatenate(_in_and_around(capture.box, points, points, count, seed))
     elif len(points) > count:

@@ -8,6 +8,7 @@ from torch.autograd.function import once_differentiable
 
 from refgs.clock import timed
 from refgs.kernels import cuda, load
+from refgs.kernels.function import Function
 from refgs.kernels.layout import struct
 from refgs.kernels.load import check, run
 from refgs.render.renderer import Rendering
@@ -35,7 +36,7 @@ _Work = struct("Losses", "losses.cpp")
 
 
 @timed("loss")
-class _Objective(torch.autograd.Function):
+class _Objective(Function):
     """Compute the training loss as an autograd function. Its derivatives are computed together with its value."""
 
     DIFFERENTIABLE = "color", "normal", "depth", "alpha", "material", "light"
@@ -44,7 +45,7 @@ class _Objective(torch.autograd.Function):
     def forward(ctx, color, normal, depth, alpha, material, light, photo, background, weights, progress):
         camera, (height, width) = photo.camera, alpha.shape
         inputs = {"color": color, "normal": normal, "depth": depth, "alpha": alpha}
-        shapes = dict.fromkeys(inputs, (height, width))
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(inputs, (height, width))
         shapes |= {"color": (height, width, 3), "normal": (height, width, 3), "background": (3,)}
         inputs["background"] = background
         if material is not None:

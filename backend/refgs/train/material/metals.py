@@ -130,7 +130,7 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
         found[state.learned["held"].cpu() & (seen.pixels > same_material.FRINGE)] = 0
     weight = seen.pixels * state.wanted().cpu()
     part = float(weight[found >= DOUBTFUL].sum()) / max(float(weight.sum()), 1e-6)
-    facts = {"part": part}
+    facts: dict[str, float | str] = {"part": part}
     if part > TOLD:
         facts["what"] = f"photos do not tell metal from paint on {part:.0%} of the surface"
         state.announce("doubt", facts["what"])

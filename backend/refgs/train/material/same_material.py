@@ -90,7 +90,7 @@ def doubt(surfels: Surfels, seen: Seen, fit: Fit) -> Tensor:
 def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray, np.ndarray]:
     """Return the graph of surfels (N, N), which of them take part (N,), and how much photos tell that each is metal, and paint (N,)."""
     graph, part = _laplacian(surfels.positions, seen), (seen.pixels > FRINGE).double().numpy()
-    ratio = fit.ratio.clamp(1e-3, 1e3).log().double().numpy() * fit.seen.numpy()
+    ratio = np.asarray((fit.ratio.clamp(1e-3, 1e3).log().double() * fit.seen).numpy())
     mirrors = (fit.slope > SLOPE) & (fit.reflectance.amax(dim=1) > REFLECTANCE)
     metal = np.where(mirrors.numpy() & (ratio < np.log(RATIO.metal)), np.clip(-ratio, 0, SURE), 0) * part
     return graph, part, metal, np.clip(ratio - np.log(RATIO.paint), 0, SURE) * part
