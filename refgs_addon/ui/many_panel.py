@@ -142,7 +142,7 @@ def _draw_batch(box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
     for warning in job.warnings:
         wrapped_text(box, warning[0].upper() + warning[1:], width, "ERROR")
     if not job.ended:
-        command_button(box, job, "cancel", "Stop", "CANCEL")
+        command_button(box, job, "cancel", text="Stop", icon="CANCEL")
         icon = "CHECKBOX_HLT" if job.kept else "CHECKBOX_DEHLT"
         box.operator(KeepTraining.bl_idname, icon=icon, emboss=False).serial = job.serial
     if job.state == "failed":

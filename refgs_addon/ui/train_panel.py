@@ -221,15 +221,17 @@ def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job, wid
         box.template_icon(icon_value=shown, scale=10)
     if job.run and job.state in ("running", "paused") and "train" not in job.results:
         row = box.row(align=True)
-        command = "resume" if job.state == "paused" else "pause"
-        command_button(row, job, command, command.title(), "PLAY" if command == "resume" else "PAUSE")
-        command_button(row, job, "stop", "Finish", "CHECKMARK")
-        command_button(row, job, "cancel", "Stop", "CANCEL")
+        if job.state == "paused":
+            command_button(row, job, "resume", text="Resume", icon="PLAY")
+        else:
+            command_button(row, job, "pause", text="Pause", icon="PAUSE")
+        command_button(row, job, "stop", text="Finish", icon="CHECKMARK")
+        command_button(row, job, "cancel", text="Stop", icon="CANCEL")
         watched = live_splats.is_watched(job)
         icon = "HIDE_OFF" if watched else "HIDE_ON"
         box.operator(ShowLiveSplats.bl_idname, icon=icon, depress=watched).serial = job.serial
     elif not job.ended:
-        command_button(box, job, "cancel", "Stop", "CANCEL")
+        command_button(box, job, "cancel", text="Stop", icon="CANCEL")
     if job.run and not job.ended:
         icon = "CHECKBOX_HLT" if job.kept else "CHECKBOX_DEHLT"
         box.operator(KeepTraining.bl_idname, icon=icon, emboss=False).serial = job.serial
@@ -305,7 +307,7 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
 
 
-def command_button(layout: bpy.types.UILayout, job: jobs.Job, command: str, text: str, icon: str) -> None:
+def command_button(layout: bpy.types.UILayout, job: jobs.Job, command: str, *, text: str, icon: str) -> None:
     """Draw a button that sends a command to a job."""
     button = layout.operator(SendCommand.bl_idname, text=text, icon=icon)
     button.serial, button.command = job.serial, command
