@@ -1,7 +1,7 @@
 """Check that modules of the trainer and of the extension import only what they may.
 
 The trainer's packages are ordered in layers, called floors. A module imports only from its own floor and from those below. There are no
-import cycles. The trainer never imports bpy. The extension never imports torch.
+import cycles. The trainer never imports bpy. The extension never imports torch. Only tests and benchmarks import the float64 reference.
 
     python scripts/check_imports.py [FOLDER]      # this repository, or a folder that is laid out like it
 
@@ -34,6 +34,7 @@ FLOORS = (
     ("batch",),
     ("cli", "commands", "demo", "train_job", "worker"),
 )
+ORACLE = "refgs.render.reference"  # float64, for tests and benchmarks, which compare the kernels with it
 FORBIDDEN = {"backend": ("bpy", "refgs_addon"), "refgs_addon": ("torch", "refgs")}
 
 
@@ -110,6 +111,11 @@ def check(root: Path) -> list[str]:
         if package == "refgs":
             lost = [name for name in files if floor(name) is None]
             wrong += [f"{files[name].relative_to(root).as_posix()}: {name} has no floor in FLOORS" for name in lost]
+            wrong += [
+                f"{place}: {source} imports {ORACLE}: only tests and benchmarks do"
+                for source, target, place in inside
+                if target == ORACLE
+            ]
             for source, target, place in inside:
                 if None not in (low := floor(source), high := floor(target)) and low < high:
                     wrong.append(f"{place}: {source} imports {target}, which is on a floor above its own")
