@@ -65,7 +65,7 @@ class Job:
     no_cameras: bool = False  # failed because the photos have no cameras: `find_cameras` finds them
     curve: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR of the training views
     held_out: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR of the held-out views
-    serial: int = field(default_factory=count().__next__)  # unique
+    serial: int = field(default_factory=count(1).__next__)  # unique, and never 0
     kept: bool = False  # finishes even if Blender closes
     then: Callable[["Job"], None] | None = None  # called once, when the job is done
     _stopped: bool = False
@@ -246,6 +246,14 @@ def _read_events(process: subprocess.Popen, heard: queue.SimpleQueue) -> None:
 
 JOBS: list[Job] = []
 """Jobs of this session that have not been dismissed, oldest first. One training runs at a time."""
+
+
+def find(serial: int) -> Job:
+    """Find a job in the list by its `serial`. Raises InputError if it was dismissed."""
+    for job in JOBS:
+        if job.serial == serial:
+            return job
+    raise InputError("this job is no longer in the list: nothing was done")
 
 
 def check(python: Path, capture: Path, out: Path, log: Path) -> Job:

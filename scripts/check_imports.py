@@ -1,7 +1,7 @@
 """Check that modules of the trainer and of the extension import only what they may.
 
 The trainer's packages are ordered in layers, called floors. A module imports only from its own floor and from those below. There are no
-import cycles. The trainer never imports bpy. The extension never imports torch.
+import cycles. The trainer never imports bpy. The extension never imports torch. Only tests and benchmarks import the float64 reference.
 
     python scripts/check_imports.py [FOLDER]      # this repository, or a folder that is laid out like it
 
@@ -48,6 +48,7 @@ ROOMS = (
     ("trainer",),
     ("fit", "hints"),
 )
+ORACLE = "refgs.render.reference"  # float64, for tests and benchmarks, which compare the kernels with it
 FORBIDDEN = {"backend": ("bpy", "refgs_addon"), "refgs_addon": ("torch", "refgs")}
 
 
@@ -132,6 +133,11 @@ def check(root: Path) -> list[str]:
             lost = [name for name in files if floor(name) is None]
             wrong += [
                 f"{files[name].relative_to(root).as_posix()}: {name} has no floor in FLOORS or ROOMS" for name in lost
+            ]
+            wrong += [
+                f"{place}: {source} imports {ORACLE}: only tests and benchmarks do"
+                for source, target, place in inside
+                if target == ORACLE
             ]
             for source, target, place in inside:
                 if None not in (low := floor(source), high := floor(target)) and low < high:

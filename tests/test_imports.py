@@ -24,6 +24,8 @@ def write(root, files):
         "backend/refgs/camera.py": "import numpy",
         "backend/refgs/model/__init__.py": "",
         "backend/refgs/model/surfels.py": "import torch\nfrom refgs.camera import Camera",
+        "backend/refgs/render/__init__.py": "",
+        "backend/refgs/render/reference.py": "",
         "backend/refgs/train/__init__.py": "",
         "backend/refgs/train/learn/__init__.py": "",
         "backend/refgs/train/learn/loop.py": "from refgs.model import surfels\nfrom refgs.train.learn.adam import Adam",
@@ -68,6 +70,11 @@ HIDDEN = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from refgs.tr
         ("backend/refgs/camera.py", "from bpy.types import A", ["camera.py:1", "nothing under backend/ imports bpy"]),
         ("refgs_addon/jobs.py", "import torch.cuda", ["jobs.py:1", "nothing under refgs_addon/ imports torch"]),
         ("refgs_addon/jobs.py", "from refgs import run", ["jobs.py:1", "nothing under refgs_addon/ imports refgs"]),
+        (
+            "backend/refgs/train/adam.py",
+            "from refgs.render import reference",
+            ["adam.py:1", "refgs.render.reference: only tests and benchmarks do"],
+        ),
         ("backend/refgs/new.py", "", ["new.py", "refgs.new has no floor"]),
     ],
 )

@@ -35,11 +35,10 @@ class ShowCameras(OnJob, bpy.types.Operator):
                 show_guessed_region(context.scene, checked["centre"], checked["radius"])
 
 
-def draw_capture(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job) -> None:
+def draw_capture(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job) -> None:
     """Draw the result of a capture's check: some photos, and a button that shows the cameras.
 
-    `job` is the job that made the check, and `number` is its index in the list of jobs. Draws nothing if the job is of another kind or has
-    not ended.
+    `job` is the job that made the check. Draws nothing if the job is of another kind or has not ended.
     """
     checked = job.results.get("check", {})
     if "cameras" not in checked:
@@ -48,7 +47,7 @@ def draw_capture(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, j
     for file in checked["thumbnails"]:
         grid.template_icon(icon_value=thumbnail(Path(file), job.serial), scale=3)
     shown = cameras_of(scene, Path(checked["capture"])) is not None
-    box.operator(ShowCameras.bl_idname, icon="OUTLINER_OB_CAMERA", depress=shown).number = number
+    box.operator(ShowCameras.bl_idname, icon="OUTLINER_OB_CAMERA", depress=shown).serial = job.serial
 
 
 CLASSES = (ShowCameras,)

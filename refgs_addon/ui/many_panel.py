@@ -111,9 +111,9 @@ class ManyPanel(Tab, bpy.types.Panel):
         for name in ("captures", "results", "preset"):
             column.prop(settings, name)
         layout.operator(TrainMany.bl_idname, icon="PLAY")
-        for number, job in enumerate(jobs.JOBS):
+        for job in jobs.JOBS:
             if job.kind == "batch":
-                _draw_batch(layout.box(), number, job, width)
+                _draw_batch(layout.box(), job, width)
         folder = many.results_folder(context.scene)
         if folder is None:
             return
@@ -123,18 +123,18 @@ class ManyPanel(Tab, bpy.types.Panel):
             _draw_other_process(layout.box(), context, folder)
         if batch_table.is_shown(folder) and context.window_manager.refgs_rows:
             _draw_table(layout, context, folder, width)
-        for number, job in enumerate(jobs.JOBS):
+        for job in jobs.JOBS:
             if job.kind == "library":
-                _draw_library(layout.box(), number, job, width)
+                _draw_library(layout.box(), job, width)
 
 
-def _draw_batch(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int) -> None:
+def _draw_batch(box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
     """Draw a batch that this Blender started. `width` is how many letters fit into a line."""
     head = box.row()
     icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE"}.get(job.state, "SORTTIME")
     head.label(text=job.name, icon=icon)
     if job.ended:
-        head.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).number = number
+        head.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).serial = job.serial
     if job.active or (job.ended and job.progress):
         box.progress(factor=fraction(job), text=status_words(job).capitalize())
     if job.line:
@@ -142,9 +142,9 @@ def _draw_batch(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int)
     for warning in job.warnings:
         wrapped_text(box, warning[0].upper() + warning[1:], width, "ERROR")
     if not job.ended:
-        command_button(box, number, "cancel", "Stop", "CANCEL")
+        command_button(box, job, "cancel", text="Stop", icon="CANCEL")
         icon = "CHECKBOX_HLT" if job.kept else "CHECKBOX_DEHLT"
-        box.operator(KeepTraining.bl_idname, icon=icon, emboss=False).number = number
+        box.operator(KeepTraining.bl_idname, icon=icon, emboss=False).serial = job.serial
     if job.state == "failed":
         box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
 
@@ -175,11 +175,11 @@ def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, folder: 
     layout.operator(ImportAsAssets.bl_idname, icon="ASSET_MANAGER")
 
 
-def _draw_library(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int) -> None:
+def _draw_library(box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
     """Draw the job that makes runs assets."""
     row = box.row()
     row.label(text=job.name, icon={"done": "CHECKMARK", "failed": "ERROR"}.get(job.state, "SORTTIME"))
-    row.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).number = number
+    row.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).serial = job.serial
     if job.state == "done":
         made = job.results["library"]
         wrapped_text(box, f"{made['written']} assets were made: choose {job.name} in the asset browser", width)

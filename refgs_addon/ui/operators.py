@@ -43,15 +43,18 @@ class ReportsErrors:
 
 
 class OnJob(ReportsErrors):
-    """Give an operator the job at the index `number` in the list of jobs. Base class of the operators on one job."""
+    """Give an operator the job that its button was drawn for. Base class of the operators on one job.
+
+    The job is found by its serial: its place in the list changes when another job is dismissed.
+    """
 
     bl_options: ClassVar = {"REGISTER"}
 
-    number: IntProperty(name="Number", description="Index of the job in the list")
+    serial: IntProperty(name="Serial", description="Serial number of the job", options={"SKIP_SAVE"})
 
     @property
     def job(self) -> jobs.Job:
-        return jobs.JOBS[self.number]
+        return jobs.find(self.serial)
 
 
 class OnCapture(ReportsErrors):

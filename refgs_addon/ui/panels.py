@@ -98,14 +98,14 @@ class PreviewPanel(Tab, bpy.types.Panel):
         layout.operator(operators.RenderPreview.bl_idname, icon="RENDER_STILL")
         layout.operator(operators.ContactSheet.bl_idname, icon="IMGDISPLAY")
         layout.operator(operators.MarkAsset.bl_idname, icon="ASSET_MANAGER")
-        for number, job in enumerate(jobs.JOBS):
+        for job in jobs.JOBS:
             if job.kind == "render":
-                self._render(layout.box(), number, job)
+                self._render(layout.box(), job)
 
-    def _render(self, box: bpy.types.UILayout, number: int, job: jobs.Job) -> None:
+    def _render(self, box: bpy.types.UILayout, job: jobs.Job) -> None:
         row = box.row()
         row.label(text=job.name, icon={"done": "CHECKMARK", "failed": "ERROR"}.get(job.state, "SORTTIME"))
-        row.operator("refgs.put_away", text="", icon="X", emboss=False).number = number
+        row.operator("refgs.put_away", text="", icon="X", emboss=False).serial = job.serial
         if job.state == "done":
             png = job.results["render"]["png"]
             box.template_icon(icon_value=thumbnail(Path(png)), scale=10)

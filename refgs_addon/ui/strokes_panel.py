@@ -27,9 +27,9 @@ class StrokesPanel(bpy.types.Panel):
             column.operator(ChooseBrush.bl_idname, text=PAINTS[paints][0], icon=icon).paints = paints
         layout.label(text="The mask leaves out what is red")
         layout.operator(SaveStrokes.bl_idname, icon="FILE_TICK")
-        for number, job in enumerate(jobs.JOBS):
+        for job in jobs.JOBS:
             if job.kind == "masks":
-                draw_job(layout.box(), context.scene, number, job, width)
+                draw_job(layout.box(), context.scene, job, width)
 
 
 CLASSES = (StrokesPanel,)

@@ -180,21 +180,21 @@ class TrainPanel(Tab, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator(CheckCapture.bl_idname, icon="VIEWZOOM")
         row.operator(Train.bl_idname, icon="PLAY")
-        for number, job in enumerate(jobs.JOBS):
+        for job in jobs.JOBS:
             if job.program == jobs.TRAINER and job.kind != "batch" and job not in preferences.own_jobs():
-                draw_job(layout.box(), context.scene, number, job, width)
+                draw_job(layout.box(), context.scene, job, width)
         for known in settings.runs:
             if not any(job.run == Path(known.folder) for job in jobs.JOBS):
                 _draw_run(layout.box(), context.scene, Path(known.folder), width)
 
 
-def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job, width: int) -> None:
+def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job, width: int) -> None:
     """Draw a job of the trainer: its progress, what it found, and its buttons. `width` is how many letters fit into a line."""
     head = box.row()
     icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE", "paused": "PAUSE"}.get(job.state, "SORTTIME")
     head.label(text=job.name, icon=icon)
     if job.ended:
-        head.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).number = number
+        head.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).serial = job.serial
     if job.active and (job.run or ("stage" in job.progress and not job.results)):
         box.progress(factor=fraction(job), text=status_words(job).capitalize())
     if job.line:
@@ -204,7 +204,7 @@ def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: 
         wrapped_text(box, warning[0].upper() + warning[1:], width, "ERROR")
     for line in job.results.get("check", {}).get("lines", ()):
         wrapped_text(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
-    draw_capture(box, scene, number, job)
+    draw_capture(box, scene, job)
     if file := job.results.get("export", {}).get("display_splats"):
         wrapped_text(box, f"Wrote {file}", width)
     if job.curve:
@@ -221,18 +221,20 @@ def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: 
         box.template_icon(icon_value=shown, scale=10)
     if job.run and job.state in ("running", "paused") and "train" not in job.results:
         row = box.row(align=True)
-        command = "resume" if job.state == "paused" else "pause"
-        command_button(row, number, command, command.title(), "PLAY" if command == "resume" else "PAUSE")
-        command_button(row, number, "stop", "Finish", "CHECKMARK")
-        command_button(row, number, "cancel", "Stop", "CANCEL")
+        if job.state == "paused":
+            command_button(row, job, "resume", text="Resume", icon="PLAY")
+        else:
+            command_button(row, job, "pause", text="Pause", icon="PAUSE")
+        command_button(row, job, "stop", text="Finish", icon="CHECKMARK")
+        command_button(row, job, "cancel", text="Stop", icon="CANCEL")
         watched = live_splats.is_watched(job)
         icon = "HIDE_OFF" if watched else "HIDE_ON"
-        box.operator(ShowLiveSplats.bl_idname, icon=icon, depress=watched).number = number
+        box.operator(ShowLiveSplats.bl_idname, icon=icon, depress=watched).serial = job.serial
     elif not job.ended:
-        command_button(box, number, "cancel", "Stop", "CANCEL")
+        command_button(box, job, "cancel", text="Stop", icon="CANCEL")
     if job.run and not job.ended:
         icon = "CHECKBOX_HLT" if job.kept else "CHECKBOX_DEHLT"
-        box.operator(KeepTraining.bl_idname, icon=icon, emboss=False).number = number
+        box.operator(KeepTraining.bl_idname, icon=icon, emboss=False).serial = job.serial
     if job.no_cameras:
         box.operator(FindCameras.bl_idname, icon="OUTLINER_OB_CAMERA")
     elif job.state == "failed":
@@ -305,10 +307,10 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
 
 
-def command_button(layout: bpy.types.UILayout, number: int, command: str, text: str, icon: str) -> None:
-    """Draw a button that sends a command to the job at the index `number`."""
+def command_button(layout: bpy.types.UILayout, job: jobs.Job, command: str, *, text: str, icon: str) -> None:
+    """Draw a button that sends a command to a job."""
     button = layout.operator(SendCommand.bl_idname, text=text, icon=icon)
-    button.number, button.command = number, command
+    button.serial, button.command = job.serial, command
 
 
 def _draw_run(box: bpy.types.UILayout, scene: bpy.types.Scene, folder: Path, width: int) -> None:

@@ -35,6 +35,17 @@ def test_a_training_to_its_end(start, tmp_path):
     assert job._process.wait(timeout=10) == 0
 
 
+def test_a_job_is_found_when_an_earlier_one_is_dismissed(start):
+    first, second = start(out="a", mesh=False), start(out="b", mesh=False)
+    assert jobs.find(first.serial) is first and jobs.find(second.serial) is second
+    jobs.JOBS.remove(first)
+    assert jobs.find(second.serial) is second
+    for gone in (first.serial, 0):
+        with pytest.raises(InputError, match="no longer in the list"):
+            jobs.find(gone)
+    jobs.JOBS.append(first)
+
+
 def test_a_training_with_hints_keeps_the_settings_of_the_run(start, tmp_path):
     job = start(hinted=(tmp_path / "old", tmp_path / "hints.json"), mesh=False)
     assert final_state(job) == "done"

@@ -80,7 +80,7 @@ def test_a_video_is_cancelled(addon, tmp_path):
     bpy.ops.refgs.photos_from_video(filepath=str(tmp_path / "slow.mov"))
     job = jobs.JOBS[-1]
     until(lambda: job.progress)
-    bpy.ops.refgs.tell(number=len(jobs.JOBS) - 1, command="cancel")
+    bpy.ops.refgs.tell(serial=job.serial, command="cancel")
     assert final_state(job) == "cancelled" and not addon.refgs.capture and not (tmp_path / "slow").exists()
 
 

@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import bpy
@@ -19,10 +20,9 @@ from refgs_addon.scene.camera_objects import photo_shown
 from refgs_addon.scene.capture_cameras import cameras_of
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.splat_cloud import read_rows
-from refgs_addon.ui import checked_capture
+from refgs_addon.ui import checked_capture, train_panel
 from refgs_addon.ui.closing import quit_question
 from refgs_addon.ui.icons import CURVE, DOTS, GRID, LINE, plot
-from refgs_addon.ui.train_panel import other_process_status
 from tests.makers.captures import edit
 from tests.makers.waiting import final_state, until
 
@@ -52,16 +52,16 @@ def test_the_trainer_is_asked_when_it_is_chosen(addon):
 def test_the_buttons_train_and_the_file_remembers(addon, capture, tmp_path):
     addon.refgs.limited, addon.refgs.minutes, addon.refgs.mesh = True, 3.0, False
     assert bpy.ops.refgs.train() == {"FINISHED"}
-    job, number, out = jobs.JOBS[-1], len(jobs.JOBS) - 1, tmp_path / "good photos RefGS"
+    job, out = jobs.JOBS[-1], tmp_path / "good photos RefGS"
     assert job.run == out and addon.refgs.runs[0].folder == str(out)
     until(lambda: job.progress)
-    bpy.ops.refgs.tell(number=number, command="pause")
+    bpy.ops.refgs.tell(serial=job.serial, command="pause")
     until(lambda: job.state == "paused")
-    bpy.ops.refgs.tell(number=number, command="cancel")
+    bpy.ops.refgs.tell(serial=job.serial, command="cancel")
     until(lambda: job.state == "cancelled")
     asked = json.loads((out / "started").read_text())
     assert asked["minutes"] == 3.0 and asked["preset"] is None  # the minutes choose everything
-    bpy.ops.refgs.put_away(number=number)
+    bpy.ops.refgs.put_away(serial=job.serial)
     assert job not in jobs.JOBS
     # Saved and opened again, the file lists the run, which is resumed.
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
@@ -75,6 +75,56 @@ def test_the_buttons_train_and_the_file_remembers(addon, capture, tmp_path):
         training.resume(scene, out)
     training.forget(scene, out)
     assert not scene.refgs.runs and out.is_dir()
+
+
+class Buttons:
+    """Stand in for a layout, and record the buttons that a panel draws: `drawn` has the name and the properties of each operator."""
+
+    def __init__(self):
+        self.drawn = []
+
+    def operator(self, name, **_):
+        self.drawn.append((name.removeprefix("refgs."), SimpleNamespace()))
+        return self.drawn[-1][1]
+
+    def panel(self, *_, **__):
+        return self, None
+
+    def __getattr__(self, name):
+        return lambda *_, **__: self
+
+
+def draw_train_panel(scene):
+    """Draw the Train panel. Returns a function that clicks the first of its buttons that has a name and properties."""
+    buttons = Buttons()
+    context = Mock(**{"scene": scene, "region.width": 500, "preferences.system.ui_scale": 1.0})
+    train_panel.TrainPanel.draw(Mock(layout=buttons), context)
+
+    def click(name, **properties):
+        drawn = [vars(button) for other, button in buttons.drawn if other == name]
+        getattr(bpy.ops.refgs, name)(**next(button for button in drawn if properties.items() <= button.items()))
+
+    return click
+
+
+def test_a_click_reaches_the_job_that_was_drawn(addon, capture):
+    """Check that a panel that was drawn before a job was dismissed acts on no other job, and on none once its own job is gone."""
+    addon.refgs.mesh = False
+    first, second, third = (training.train(addon) for _ in range(3))
+    first.stop()
+    until(lambda: second.progress)
+    assert first.state == "cancelled" and third.state == "waiting"
+    click = draw_train_panel(addon)
+    click("put_away")
+    assert first not in jobs.JOBS
+    click("tell", command="cancel")
+    assert final_state(second) == "cancelled" and not third.ended
+    draw_train_panel(addon)("put_away")
+    assert second not in jobs.JOBS and third in jobs.JOBS
+    for button in ({"command": "cancel"}, {"command": "pause"}):
+        with pytest.raises(RuntimeError, match="no longer in the list: nothing was done"):
+            click("tell", **button)
+    assert final_state(third) == "done"
 
 
 def test_what_is_to_be_learned(addon, capture):
@@ -118,12 +168,12 @@ def test_a_capture_that_is_not_there(addon):
 
 @pytest.fixture
 def checked(addon, capture):
-    """Run the check of the capture, with the fake trainer. Returns the job of this check and its index in the add-on's list of jobs."""
+    """Run the check of the capture, with the fake trainer. Returns the job of this check."""
     job = training.check(addon)
     assert final_state(job) == "done"
     for number in range(2):
         shutil.copy(job.results["check"]["thumbnails"][number], capture / f"{number}.png")
-    return job, len(jobs.JOBS) - 1
+    return job
 
 
 def test_the_curve_in_the_panel():
@@ -147,16 +197,15 @@ def test_the_curve_in_the_panel():
 
 
 def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
-    job, number = checked
     layout, thumbnail = Mock(), Mock(side_effect=[1, 2, 1, 2])
     monkeypatch.setattr(checked_capture, "thumbnail", thumbnail)  # Blender has no icons without a window
-    checked_capture.draw_capture(layout, addon, number, job)
+    checked_capture.draw_capture(layout, addon, checked)
     drawn = layout.grid_flow.return_value.template_icon.call_args_list
     assert [icon.kwargs["icon_value"] for icon in drawn] == [1, 2]
     pictures = [(file.name, version) for (file, version), _ in thumbnail.call_args_list]
-    assert pictures == [("0000.png", job.serial), ("0001.png", job.serial)]
+    assert pictures == [("0000.png", checked.serial), ("0001.png", checked.serial)]
     assert not layout.operator.call_args.kwargs["depress"]
-    assert bpy.ops.refgs.show_cameras(number=number) == {"FINISHED"}
+    assert bpy.ops.refgs.show_cameras(serial=checked.serial) == {"FINISHED"}
     cameras = cameras_of(addon, capture)
     assert cameras.name == "good photos cameras" and [item.name for item in cameras.objects] == ["0", "1"]
     assert tuple(cameras.objects[1].matrix_world.translation) == (-4, 0, 0) and addon.camera == cameras.objects[0]
@@ -164,9 +213,9 @@ def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
     assert bpy.ops.refgs.next_camera() == {"FINISHED"}
     assert addon.camera == cameras.objects[1] and photo_shown(addon.camera) == 1
     assert addon.camera.data.background_images[0].image.filepath == str(capture / "1.png")
-    checked_capture.draw_capture(layout, addon, number, job)
+    checked_capture.draw_capture(layout, addon, checked)
     assert layout.operator.call_args.kwargs["depress"]
-    bpy.ops.refgs.show_cameras(number=number)
+    bpy.ops.refgs.show_cameras(serial=checked.serial)
     assert cameras_of(addon, capture) is None and not bpy.data.cameras and addon.camera is None
     assert not bpy.ops.refgs.next_camera.poll()
 
@@ -176,14 +225,13 @@ def test_a_run_brings_its_own_cameras(addon, checked, capture, run_folder):
 
     The active camera becomes the run's camera of the same photo.
     """
-    _, number = checked
 
     def rename(content):
         for frame, name in zip(content["frames"], ("1", "0"), strict=True):
             frame.update(file_path=f"images/{name}", photo=f"{name}.png")
 
     edit(run_folder / "cameras.json", rename)
-    bpy.ops.refgs.show_cameras(number=number)
+    bpy.ops.refgs.show_cameras(serial=checked.serial)
     other = import_run(run_folder, addon)
     assert len(cameras_of(addon, capture).objects) == 2 and "1" not in [item.name for item in other.cameras.values()]
     addon.camera = cameras_of(addon, capture).objects[1]
@@ -194,12 +242,11 @@ def test_a_run_brings_its_own_cameras(addon, checked, capture, run_folder):
 
 
 def test_what_else_is_among_the_cameras_stays(addon, checked):
-    _, number = checked
-    bpy.ops.refgs.show_cameras(number=number)
+    bpy.ops.refgs.show_cameras(serial=checked.serial)
     lamp = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "POINT"))
     cameras = next(item for item in addon.collection.children if item.name.endswith("cameras"))
     cameras.objects.link(lamp)
-    bpy.ops.refgs.show_cameras(number=number)
+    bpy.ops.refgs.show_cameras(serial=checked.serial)
     assert not any(item.name.endswith("cameras") for item in bpy.data.collections)
     assert bpy.data.objects["lamp"] in list(addon.collection.objects) and not bpy.data.cameras
 
@@ -320,7 +367,7 @@ def test_a_box_that_is_deleted_or_cleared_is_no_region(addon, capture):
 
 
 def test_the_box_holds_what_the_cameras_look_at(addon, checked, capture):
-    checked[0].results["check"] |= {"capture": str(capture.resolve()), "centre": [1.0, 2.0, 3.0], "radius": 4.0}
+    checked.results["check"] |= {"capture": str(capture.resolve()), "centre": [1.0, 2.0, 3.0], "radius": 4.0}
     box = regions.add_training_region(addon)
     assert list(box.location) == [1, 2, 3] and list(box.scale) == [4, 4, 4]
 
@@ -330,9 +377,9 @@ def test_closing_asks_only_while_something_trains(addon, capture):
     first, second = training.train(addon), training.train(addon)
     until(lambda: first.progress)
     assert bpy.ops.refgs.quit.poll() and quit_question() == "2 trainings are running or waiting"
-    bpy.ops.refgs.keep(number=jobs.JOBS.index(first))
+    bpy.ops.refgs.keep(serial=first.serial)
     assert first.kept and not second.kept
-    bpy.ops.refgs.keep(number=jobs.JOBS.index(first))
+    bpy.ops.refgs.keep(serial=first.serial)
     assert not first.kept
     jobs.keep_all(True)
     assert first.kept and second.kept
@@ -355,14 +402,14 @@ def test_a_run_that_another_process_trains(addon, capture, tmp_path):
     with FileLock(run / "run.lock"):
         assert jobs.run_state(run) == "training" and job_timers._poll_other_processes() == job_timers.OTHER_SECONDS
         (run / "progress.json").write_text('{"iteration": 250, "total": 1000, "seconds_left": 190.0}')
-        assert other_process_status(run) == (0.25, "25%, 3:10 left")
+        assert train_panel.other_process_status(run) == (0.25, "25%, 3:10 left")
         with pytest.raises(InputError, match="is being trained already"):
             training.resume(addon, run)
         bpy.ops.refgs.stop_run(folder=str(run))
-        assert (run / "stop").exists() and other_process_status(run)[1] == "Stopping"
+        assert (run / "stop").exists() and train_panel.other_process_status(run)[1] == "Stopping"
         (run / "progress.json").unlink()
         (run / "splats.ply").touch()
-        assert other_process_status(run)[1] == "Making the mesh"
+        assert train_panel.other_process_status(run)[1] == "Making the mesh"
     assert jobs.run_state(run) == "finished" and job_timers._poll_other_processes() is None
     with pytest.raises(RuntimeError, match="is not being trained"):
         bpy.ops.refgs.stop_run(folder=str(run))
@@ -370,20 +417,19 @@ def test_a_run_that_another_process_trains(addon, capture, tmp_path):
 
 def test_the_guessed_box_is_among_the_cameras(addon, checked, capture):
     """Check that the cameras of a capture without masks are shown with the guessed box, which limits nothing until it is changed."""
-    job, number = checked
-    job.results["check"] |= {"lines": ["Masks: none"], "centre": [0, 0, 1], "radius": 2.0}
-    bpy.ops.refgs.show_cameras(number=number)
+    checked.results["check"] |= {"lines": ["Masks: none"], "centre": [0, 0, 1], "radius": 2.0}
+    bpy.ops.refgs.show_cameras(serial=checked.serial)
     box = addon.refgs.region
     assert tuple(box.location) == (0, 0, 1) and tuple(box.scale) == (2.5, 2.5, 2.5)
     assert regions.artists_region(addon) is None and regions.region_settings(addon) == {}
     box.location.x = 1
     assert regions.artists_region(addon) == box and regions.region_settings(addon)["region.centre"] == [1, 0, 1]
-    bpy.ops.refgs.show_cameras(number=number)
+    bpy.ops.refgs.show_cameras(serial=checked.serial)
     assert addon.refgs.region == box, "the artist's box stays"
     box.location.x = 0
     for _ in range(2):
-        bpy.ops.refgs.show_cameras(number=number)
+        bpy.ops.refgs.show_cameras(serial=checked.serial)
     assert regions.training_region(addon) is None, "an untouched guess goes with the cameras"
-    bpy.ops.refgs.show_cameras(number=number)
+    bpy.ops.refgs.show_cameras(serial=checked.serial)
     bpy.ops.refgs.add_training_region()
     assert regions.artists_region(addon) == addon.refgs.region

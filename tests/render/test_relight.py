@@ -9,7 +9,7 @@ import trimesh
 
 from refgs.model import cubemap, harmonics
 from refgs.model.environment import Environment
-from refgs.render import reference, relight
+from refgs.render import brdf, relight
 from refgs.render.directional import directional
 from tests.makers.distances import look_at
 from tests.makers.occluders import as_occluder, bowl, even, mirrors, plate, surfels
@@ -38,7 +38,7 @@ def test_an_open_plane_has_the_whole_light():
     for angle in (0.0, 0.5, 1.0, 1.3):
         camera = look_at([3 * math.sin(angle), 0, 3 * math.cos(angle)], 8)
         found = directional(lit.sh_dc, lit.sh_rest, 0.5, lit.positions, camera)[0]
-        dielectric = reference.table(torch.tensor([math.cos(angle)]), torch.tensor([0.5]))[0, 3]
+        dielectric = brdf.look_up(torch.tensor([math.cos(angle)]), torch.tensor([0.5]))[0, 3]
         exact = (1 - dielectric) * 0.5 * light.diffuse(transport.normals)[0]
         torch.testing.assert_close(found, exact, rtol=0, atol=0.02)
 

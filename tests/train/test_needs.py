@@ -8,6 +8,7 @@ import math
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -131,8 +132,9 @@ def test_needs_are_written_down(chalk):
     rows = {row.get("need"): row for row in json.loads((chalk.state.folder / "needs.json").read_text())}
     assert {"specular", "iterations", "light"} <= {*rows}
     for name in ("specular", "light"):
-        assert math.isfinite(rows[name]["decibels"]) and rows[name]["seconds"] >= 0
-        assert rows[name]["saved"] and rows[name]["cost"] and name in chalk.state.decided
+        assert rows[name]["saved"] == f"{rows[name]['seconds']:.1f} s, {rows[name]['megabytes']:.1f} MB"
+        assert rows[name]["cost"] == f"{rows[name]['decibels']:+.3f} dB" and math.isfinite(rows[name]["decibels"])
+        assert name in chalk.state.decided
     assert rows["light"]["side"] == 16
     assert "cost" not in rows["iterations"]  # has no cost: that could not be measured
 
@@ -497,6 +499,30 @@ def test_shares_are_weights(ball_capture, tmp_path):
     mean = probe.blended_shares(surfels, [photo], made.state.near, [even])
     seen = shares[0] > 1e-3
     torch.testing.assert_close(mean[seen], torch.full_like(mean[seen], 0.3), rtol=1e-3, atol=0)
+
+
+def test_seconds_saved_are_of_all_iterations_to_come(ball_capture, tmp_path, monkeypatch):
+    """Check the seconds that a change saves, by a clock that goes on by a second at each look.
+
+    The change turns it by a quarter of a second. A change that makes iterations slower saves nothing.
+    """
+    state, clock = trainer(ball_capture, tmp_path / "run", total=40).state, SimpleNamespace(now=0.0)
+
+    def look():
+        clock.now += 1.0
+        return clock.now
+
+    def turned(seconds):
+        def change(inputs):
+            clock.now += seconds
+            return inputs
+
+        return change
+
+    monkeypatch.setattr(probe, "time", SimpleNamespace(perf_counter=look))
+    left = state.cost(state.iteration, state.total)
+    assert left > 0 and probe.seconds_saved(state, turned(-0.25)) == pytest.approx(0.25 * left)
+    assert probe.seconds_saved(state, turned(0.25)) == 0
 
 
 def test_training_does_not_load_torchs_compiler(ball_capture, tmp_path):

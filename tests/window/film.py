@@ -60,8 +60,8 @@ def artist():
     bpy.ops.refgs.find_cameras()
     yield ended
     report["placed"] = jobs()[-1].results["poses"]["placed"]
-    for _ in range(len(jobs()) - 1):
-        bpy.ops.refgs.put_away(number=1)
+    for job in jobs()[1:]:
+        bpy.ops.refgs.put_away(serial=job.serial)
     bpy.ops.refgs.make_masks()
     yield ended
     report["masks"] = jobs()[-1].results["masks"]["made"]

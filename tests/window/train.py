@@ -34,7 +34,7 @@ def last(state):
 
 
 def tell(command):
-    bpy.ops.refgs.tell(number=len(jobs()) - 1, command=command)
+    bpy.ops.refgs.tell(serial=jobs()[-1].serial, command=command)
 
 
 def artist():
@@ -57,15 +57,15 @@ def artist():
     bpy.ops.refgs.check_capture()
     yield last("done"), "checked"
     report["checked"] = jobs()[-1].results["check"]["lines"]
-    bpy.ops.refgs.show_cameras(number=len(jobs()) - 1)
+    bpy.ops.refgs.show_cameras(serial=jobs()[-1].serial)
     bpy.ops.refgs.add_training_region()
     yield lambda: True, "cameras"
     report["cameras"] = sum(item.type == "CAMERA" for item in bpy.data.objects) - 1  # without Blender's default camera
-    bpy.ops.refgs.put_away(number=len(jobs()) - 1)
+    bpy.ops.refgs.put_away(serial=jobs()[-1].serial)
     bpy.ops.refgs.train()
     yield lambda: len(jobs()[-1].curve) > 4 and jobs()[-1].preview, "training"
     if numpy():
-        bpy.ops.refgs.watch(number=len(jobs()) - 1)
+        bpy.ops.refgs.watch(serial=jobs()[-1].serial)
         yield lambda: any(item.type == "POINTCLOUD" and len(item.data.points) for item in bpy.data.objects), "live"
     tell("pause")
     yield last("paused"), "paused"
@@ -73,7 +73,7 @@ def artist():
     yield last("cancelled"), "stopped"
     folder = jobs()[-1].run
     report["run"], report["stopped"] = str(folder), jobs()[-1].progress["iteration"]
-    bpy.ops.refgs.put_away(number=len(jobs()) - 1)
+    bpy.ops.refgs.put_away(serial=jobs()[-1].serial)
     bpy.ops.refgs.resume(folder=str(folder))
     yield lambda: jobs()[-1].progress.get("iteration", 0) > report["stopped"], "resumed"
     tell("stop")

@@ -105,3 +105,22 @@ def reflectance_table(size: int = 64, nodes: int = 16) -> Tensor:
         dielectric *= bounces(average_fresnel, energy, average_energy)
         table[row] = np.stack([fg0, fg1, np.full(size, average_energy), dielectric], axis=-1)
     return torch.from_numpy(table).float()
+
+
+def look_up(n_v: Tensor, roughness: Tensor) -> Tensor:
+    """Interpolate `reflectance_table` at cosines N·V (P,) and roughnesses (P,). Returns (P, 4), differentiable, in the type of `n_v`."""
+    values, at = reflectance_table().to(n_v.dtype), torch.stack([n_v, roughness], dim=-1)
+    places = at.clamp(LEAST_N_V, 1).sqrt() * (len(values) - 1)
+    low = places.detach().floor().clamp_max(len(values) - 2)
+    (x, y), (column, row) = (places - low).unbind(-1), low.long().unbind(-1)
+    top, bottom = (torch.lerp(values[r, column], values[r, column + 1], x[:, None]) for r in (row, row + 1))
+    return torch.lerp(top, bottom, y[:, None])
+
+
+def reflectance(n_v: Tensor, roughness: Tensor, albedo: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the reflectance under uniform light of a metal (P, 3) and of a dielectric (P, 1), for cosines N·V (P,) and roughnesses (P,).
+
+    `albedo` (P, 3) is the metal's base colour.
+    """
+    fg0, fg1, average, dielectric = look_up(n_v, roughness).split(1, dim=-1)
+    return (albedo * fg0 + fg1) * bounces((20 * albedo + 1) / 21, fg0 + fg1, average), dielectric

@@ -11,7 +11,7 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.color import srgb_encode
 from refgs.model import cubemap, prefilter
-from refgs.render.brdf import LEAST_N_V, bounces, reflectance_table
+from refgs.render.brdf import LEAST_N_V, reflectance, reflectance_table
 
 ALPHA_CUT, ALPHA_CAP, MIN_TRANSMITTANCE, LOW_PASS, FAR = 1 / 255, 0.99, 1e-4, 8.0, 1e12  # as in splat.h
 COVERED, SHIFT_LIMIT, SHIFT_ALPHA = 1 / 255, 8.0, 0.3  # as in pixels.h
@@ -199,7 +199,10 @@ def radiance_towards(
     share = metallic[:, None]
     if mirror:
         return light * share + (1 - share) * appearance
-    metal, dielectric = reflectance(dot, roughness, albedo, margins)
+    at = torch.stack([dot, roughness], dim=-1)
+    margins += [*(at - LEAST_N_V).abs().unbind(-1)]
+    margins += _from_integer(at.clamp(LEAST_N_V, 1).sqrt() * (len(reflectance_table()) - 1))
+    metal, dielectric = reflectance(dot, roughness, albedo)
     if appearance is not None:
         diffuse = (1 - share) * appearance
     else:
@@ -268,30 +271,6 @@ def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughne
     _cube_margins(directions, [torch.tensor(sides)[interval + i] for i in (0, 1)], margins)
     levels = cubemap.in_texel_order(levels, sides)
     return cubemap.sample(levels, sides, directions, interval + (alpha - low) / (high - low))
-
-
-def table(n_v: Tensor, roughness: Tensor, margins: list | None = None) -> Tensor:
-    """Interpolate `brdf.reflectance_table` at cosines N·V (P,) and roughnesses (P,). Returns (P, 4).
-
-    If `margins` is a list, distances from jumps of the derivatives are appended to it (see `shade`).
-    """
-    values, at = reflectance_table().to(n_v.dtype), torch.stack([n_v, roughness], dim=-1)
-    places = at.clamp(LEAST_N_V, 1).sqrt() * (len(values) - 1)
-    if margins is not None:
-        margins += [*(at - LEAST_N_V).abs().unbind(-1), *_from_integer(places)]
-    low = places.detach().floor().clamp_max(len(values) - 2)
-    (x, y), (column, row) = (places - low).unbind(-1), low.long().unbind(-1)
-    top, bottom = (torch.lerp(values[r, column], values[r, column + 1], x[:, None]) for r in (row, row + 1))
-    return torch.lerp(top, bottom, y[:, None])
-
-
-def reflectance(n_v: Tensor, roughness: Tensor, albedo: Tensor, margins: list | None = None) -> tuple[Tensor, Tensor]:
-    """Compute the reflectance under uniform light of a metal (P, 3) and of a dielectric (P, 1), for cosines N·V (P,) and roughnesses (P,).
-
-    `albedo` (P, 3) is the metal's colour. If `margins` is a list, distances from jumps of the derivatives are appended to it (see `shade`).
-    """
-    fg0, fg1, average, dielectric = table(n_v, roughness, margins).split(1, dim=-1)
-    return (albedo * fg0 + fg1) * bounces((20 * albedo + 1) / 21, fg0 + fg1, average), dielectric
 
 
 def dssim(image: Tensor, target: Tensor) -> Tensor:

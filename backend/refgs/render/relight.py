@@ -21,7 +21,7 @@ from refgs.geometry.visibility import Occluder
 from refgs.model import cubemap, harmonics, prefilter
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
-from refgs.render import reference
+from refgs.render.brdf import look_up, reflectance
 
 DIRECTIONS = 1024  # over the whole sphere
 BOUNCES = 4  # between the object's parts
@@ -62,7 +62,7 @@ def _split_sum(albedo: Tensor, metallic: Tensor, roughness: Tensor, cosine: Tens
     Multiply the first by prefiltered radiance from the mirror direction, the second by irradiance / π. `cosine` (P,) is that of the angle
     between normal and viewing direction.
     """
-    metal, dielectric = reference.reflectance(cosine, roughness, albedo)
+    metal, dielectric = reflectance(cosine, roughness, albedo)
     metallic = metallic[:, None]
     return metallic * metal + (1 - metallic) * dielectric, (1 - metallic) * (1 - dielectric) * albedo
 
@@ -278,7 +278,7 @@ def _diffuse_harmonics(surfels: Surfels, normals: Tensor, received: Tensor) -> T
     middle = (torch.arange(size).double() + 0.5) / size  # centres of the table's cells, in cosine and roughness
     # d points from the camera to the surfel.
     legendre = torch.from_numpy(np.polynomial.legendre.legvander(-middle.numpy(), 3))
-    coat = 1 - reference.table(middle.repeat(size), middle.repeat_interleave(size))[:, 3].view(size, size)
+    coat = 1 - look_up(middle.repeat(size), middle.repeat_interleave(size))[:, 3].view(size, size)
     zonal = torch.linalg.lstsq(legendre, coat.T).solution.T * 4 * math.pi / (2 * degrees + 1)
     zonal = zonal.repeat_interleave(2 * degrees + 1, dim=1).float()
     row = (surfels.roughness * size).long().clamp(0, size - 1)

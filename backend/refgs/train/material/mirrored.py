@@ -16,7 +16,7 @@ from refgs.geometry.mesh import smooth_normals
 from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
-from refgs.render import reference
+from refgs.render.brdf import look_up
 from refgs.render.relight import blend, mirror
 from refgs.train import probe
 from refgs.train.material.observe import GRAZING, NEIGHBOURS, OBSERVED_VIEWS, Seen, neighbours, observe_mirrored, pooled
@@ -92,7 +92,7 @@ def _fit(seen: Seen, mirrored: Iterable[list[Tensor]], positions: Tensor) -> Fit
     """Fit both materials to all photos, for each of ROUGHNESSES, and keep the best of each kind.
 
     With reflectance s and diffuse radiance c, a metal shows (s FG0 + FG1) R and paint c + F R of what it mirrors, R: FG0, FG1 and F are the
-    entries 0, 1 and 3 of `reference.table`. Sums over photos suffice for both.
+    entries 0, 1 and 3 of `brdf.reflectance_table`. Sums over photos suffice for both.
     """
     near, count = neighbours(positions, NEIGHBOURS), len(positions)
     sums = {
@@ -106,9 +106,7 @@ def _fit(seen: Seen, mirrored: Iterable[list[Tensor]], positions: Tensor) -> Fit
         shown, weight = seen.radiance[:, view], seen.weight[:, view, None].double()
         cosine = (seen.normal[:, view] * seen.towards[:, view]).sum(dim=1).clamp(GRAZING, 1)
         for index, (roughness, light) in enumerate(zip(ROUGHNESSES, lights, strict=True)):
-            first, second, _, coat = (
-                reference.table(cosine, torch.full_like(cosine, roughness)).unsqueeze(2).unbind(dim=1)
-            )
+            first, second, _, coat = look_up(cosine, torch.full_like(cosine, roughness)).unsqueeze(2).unbind(dim=1)
             rest, reflected, dull = shown - second * light, first * light, shown - coat * light
             sums["rest"][index] += weight * rest.square()
             sums["both"][index] += weight * rest * reflected

@@ -1,0 +1,268 @@
+"""Find the layout of a capture's folder, and read its cameras and the list of its photos into the run's frame."""
+
+import hashlib
+import os
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from refgs.capture.box import Box
+from refgs.capture.colmap import capture_root, find_model, read_colmap
+from refgs.capture.files import find_photos
+from refgs.capture.nerf_blender import read_nerf_blender
+from refgs.capture.nerfstudio import read_nerfstudio
+from refgs.capture.nero import read_nero
+from refgs.capture.poses import in_frame
+from refgs.capture.priors import with_priors
+from refgs.capture.region import (
+    WHITE_MASKS,
+    Region,
+    find_region,
+    is_near,
+    region_in,
+    run_frame,
+    sample_silhouettes,
+    up_direction,
+)
+from refgs.capture.stanford_orb import NOVEL, read_stanford_orb
+from refgs.capture.tensoir import is_tensoir, read_tensoir
+from refgs.capture.types import Z_UP, Capture, CaptureFiles, View
+from refgs.errors import InputError, NoCameras
+from refgs.paths import check_folder, check_unicode, command_line
+from refgs.settings import RegionSettings
+
+
+def find_layout(folder: Path) -> str | None:
+    """Return the layout of a folder's camera files: "nerf-blender", "stanford-orb", "tensoir", "nerfstudio", "colmap" or "nero".
+
+    Return None if the folder has no camera files.
+    """
+    if is_tensoir(folder):  # first, because copies of the data set have a transforms_train.json, too
+        return "tensoir"
+    if (folder / "transforms_train.json").is_file():
+        return "stanford-orb" if (folder / NOVEL).is_file() else "nerf-blender"
+    if (folder / "transforms.json").is_file():
+        return "nerfstudio"
+    if find_model(folder) is not None:
+        return "colmap"
+    return "nero" if (folder / "0-camera.pkl").is_file() else None
+
+
+def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
+    """Read the photos' cameras from a capture's folder, and convert them to the run's frame, the world coordinates used in training.
+
+    `wanted` may set a box around the part to reconstruct, and an up direction. Give both in the run's frame that results from a call
+    without `wanted`. Only the photos' headers and some masks are read; photos are not decoded.
+    Raises InputError with a message of one line.
+    """
+    return to_run_frame(read_files(folder), wanted)
+
+
+def read_files(folder: Path) -> CaptureFiles:
+    """Read the photos' cameras from a capture's folder, in the capture's own coordinates. No photo and no mask is decoded."""
+    folder = Path(folder)
+    layout = _check_layout(folder)
+    views, points, colors, warnings = _read(folder, layout)
+    _check_photos(views)
+    shared = _shared_photos(views)
+    views = _hold_out(views)
+    _check_cameras(folder, views)
+    views = _unique_names(views)
+    views = with_priors(views, capture_root(folder, layout))
+    return CaptureFiles(folder, layout, views, points, colors, [*warnings, *shared])
+
+
+def to_run_frame(files: CaptureFiles, wanted: RegionSettings | None = None) -> Capture:
+    """Convert what was read of a capture to the run's frame. `wanted` is as for `read_capture`. Some masks are read."""
+    folder, layout, points = files.folder, files.layout, files.points
+    views, silhouettes, white = _silhouettes(files.views)
+    up = up_direction(views)
+    region = find_region(views, up, points, silhouettes)
+    to_capture, unit = _run_frame(layout, region, up)
+    box, reach = None, region.radius
+    if wanted is not None and any(wanted.size):
+        box = Box.of(wanted).moved(to_capture)
+        region, reach = _narrow(region, box, views, silhouettes)
+    if wanted is not None and any(wanted.up):
+        to_capture = to_capture @ run_frame(np.array(wanted.up) / np.linalg.norm(wanted.up), np.zeros(3), 1.0)
+    capture = Capture(
+        folder=folder,
+        layout=layout,
+        views=views,
+        to_capture=to_capture,
+        points=points,
+        point_colors=files.colors,
+        bounded=region.bounded,
+        bounded_because=region.because,
+        centre=region.centre,
+        radius=region.radius,
+        reach=reach,
+        box=box,
+        digest=_digest(folder, layout, views),
+        warnings=[*files.warnings, *white],
+    )
+    return capture if np.array_equal(to_capture, np.eye(4)) else _in_run_frame(capture, unit)
+
+
+def _check_layout(folder: Path) -> str:
+    """Return the file layout of a capture's folder, such as "colmap". Raise InputError if the folder holds no capture."""
+    check_folder(folder)
+    layout = find_layout(folder)
+    if layout is not None:
+        return layout
+    if photos := find_photos(folder):
+        search = command_line("refgs", "poses", folder)
+        raise NoCameras(f"{folder}: {len(photos)} photos, but no cameras. Find them first: {search}")
+    raise InputError(
+        f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender, Stanford-ORB), transforms.json "
+        "(nerfstudio, instant-ngp), sparse/0 (COLMAP), 0-camera.pkl (NeRO), train_000/metadata.json (TensoIR), and for "
+        "photos, here and in images. "
+        "Name the folder that holds them."
+    )
+
+
+def _read(folder: Path, layout: str) -> tuple[list[View], np.ndarray | None, np.ndarray | None, list[str]]:
+    """Read a capture with the reader for its layout.
+
+    Return the views (photos with cameras), the structure-from-motion points and their colours, and warnings. Points and colours are None if
+    this layout has none.
+    """
+    match layout:
+        case "nerf-blender":
+            return read_nerf_blender(folder), None, None, []
+        case "stanford-orb":
+            return read_stanford_orb(folder), None, None, []
+        case "tensoir":
+            views, warnings = read_tensoir(folder)
+            return views, None, None, warnings
+        case "nerfstudio":
+            return read_nerfstudio(folder)
+        case "colmap" if (model := find_model(folder)) is not None:
+            return *read_colmap(*model), []
+    views, warnings = read_nero(folder)
+    return views, None, None, warnings
+
+
+def _check_photos(views: list[View]) -> None:
+    for (_, path), count in Counter((view.split, view.image_path) for view in views).items():
+        if count > 1:
+            raise InputError(f"{path}: the capture names this photo {count} times. Remove all of its frames but one.")
+        check_unicode(path)
+
+
+def _shared_photos(views: list[View]) -> list[str]:
+    """Check whether photos are both training and test views. Return a list with one warning if so, otherwise an empty list."""
+    tested, trained = ({view.image_path for view in views if view.split == split} for split in ("test", "train"))
+    shared = tested & trained
+    if not shared:
+        return []
+    twice = f"{len(shared)} photos are both trained and tested on, first {min(shared).name}"
+    return [f"{twice}: the figures will be too good; name each in one of the two files"]
+
+
+def _hold_out(views: list[View]) -> list[View]:
+    """Choose test views for a capture that has none: every eighth view, sorted by path. They are held out from training."""
+    if any(view.split == "test" for view in views):
+        return views
+    views = sorted(views, key=lambda view: view.image_path.as_posix())
+    return [replace(view, split="train" if i % 8 else "test") for i, view in enumerate(views)]
+
+
+def _check_cameras(folder: Path, views: list[View]) -> None:
+    train = [view for view in views if view.split == "train"]
+    if len(train) < 3:
+        raise InputError(
+            f"{folder}: {len(train)} training views (of {len(views)}; the rest are held out for testing). "
+            "At least three are needed, thirty or more are good: add photos."
+        )
+    positions = np.array([view.camera.position for view in train])
+    if np.ptp(positions, axis=0).max() <= 1e-6 * np.abs(positions).max():
+        raise InputError(f"{folder}: all cameras are in one place, so no depth can be seen. Photograph from around it.")
+
+
+def _unique_names(views: list[View]) -> list[View]:
+    """Make the cameras' names unique within each split ("train", "test").
+
+    If several photos have the same file name, their cameras' names get the folder's path in front. Raises InputError if that does not help.
+    """
+    names = Counter((view.split, view.camera.name) for view in views)
+    top = os.path.commonpath(
+        [os.path.abspath(view.image_path.parent) for view in views]
+    )  # a file may name some absolutely
+
+    def name(view: View) -> str:
+        if names[view.split, view.camera.name] == 1:
+            return view.camera.name
+        return Path(os.path.relpath(view.image_path, top)).with_suffix("").as_posix().replace("/", "_")
+
+    views = [replace(view, camera=replace(view.camera, name=name(view))) for view in views]
+    (_, twice), count = Counter((view.split, view.camera.name) for view in views).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"{top}: {count} photos are named {twice}, with different endings. Rename them apart.")
+    return views
+
+
+def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.ndarray]], list[str]]:
+    """Choose some of the views that have masks, and reduce their masks to low resolution.
+
+    Return all views, a list of the pairs (view, reduced mask), and warnings. If the chosen masks are all white everywhere, they are
+    useless: then return the views without masks, an empty list of pairs, and a warning.
+    """
+    silhouettes = sample_silhouettes(views)
+    if silhouettes or not any(view.masked for view in views):
+        return views, silhouettes, []
+    views = [replace(view, mask_path=None, has_alpha=False) for view in views]
+    return views, [], [WHITE_MASKS]
+
+
+def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray, float]:
+    """Choose the run's frame: +Z is up, and the region of interest is a ball of radius 1 about the origin.
+
+    Return the similarity transform (4, 4) from the run's frame to the capture's, and its scale. A capture whose layout is one of Z_UP keeps
+    its own coordinates, unless its region of interest is so far away, so large or so small that float32 is too inexact.
+    """
+    if layout in Z_UP:
+        if is_near(region):
+            return np.eye(4), 1.0
+        up = np.array([0.0, 0.0, 1.0])
+    return run_frame(up, region.centre, region.radius), region.radius
+
+
+def _narrow(whole: Region, box: Box, views: list[View], silhouettes: list) -> tuple[Region, float]:
+    """Reduce the region of interest to the part inside a box.
+
+    Return the new region, and the radius of a ball about its centre that contains the old region `whole`.
+    """
+    region = region_in(box, views, silhouettes)
+    return region, whole.radius + float(np.linalg.norm(whole.centre - region.centre))
+
+
+def _in_run_frame(capture: Capture, unit: float) -> Capture:
+    """Convert a capture's cameras, points and box to the run's coordinates. One unit of the run is `unit` units of the capture."""
+    to_run = np.linalg.inv(capture.to_capture)
+    points = capture.points
+    return replace(
+        capture,
+        views=[replace(view, camera=in_frame(view.camera, to_run)) for view in capture.views],
+        points=None if points is None else points @ to_run[:3, :3].T + to_run[:3, 3],
+        box=None if capture.box is None else capture.box.moved(to_run),
+        centre=to_run[:3, :3] @ (capture.centre - capture.to_capture[:3, 3]),
+        radius=capture.radius / unit,
+        reach=capture.reach / unit,
+    )
+
+
+def _digest(folder: Path, layout: str, views: list[View]) -> str:
+    digest = hashlib.sha256(layout.encode())
+    for view in views:
+        camera = view.camera
+        digest.update(f"{camera.name} {view.split}".encode())
+        for path in (view.image_path, view.mask_path):
+            if path is not None:
+                digest.update(f" {Path(os.path.relpath(path, folder)).as_posix()} {path.stat().st_size}".encode())
+        numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+        # Rounded: the last bits differ between processors.
+        digest.update((np.round([*numbers, *camera.world_to_camera.ravel()], 6) + 0.0).tobytes())
+    return digest.hexdigest()
