@@ -37,7 +37,7 @@ def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
             emulate(monkeypatch)
         steps = [made.step() for _ in range(3)]
         figures.append([[float(step[name]) for name in ("loss", "square")] for step in steps])
-        values.append(made.state.learned.by_row)
+        values.append({name: value for name, value in made.state.learned.by_row.items() if value.is_floating_point()})
     np.testing.assert_allclose(figures[0], figures[1], rtol=1e-3)
     for name, value in values[0].items():
         # Adam's first steps follow the sign of the gradient, which rounding may flip where gradients are tiny.

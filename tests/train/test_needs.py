@@ -25,6 +25,7 @@ from refgs.train.decide import iterations, lighting, needs, photos
 from refgs.train.decide.materials import SHINES
 from refgs.train.keep.asset import write_asset
 from refgs.train.keep.measures import held_out_psnr
+from refgs.train.learn.coarse import cost
 from refgs.train.learn.losses import objective
 from refgs.train.photo import MARGIN, Photo, bounds
 from refgs.train.plan import Plan
@@ -520,7 +521,7 @@ def test_seconds_saved_are_of_all_iterations_to_come(ball_capture, tmp_path, mon
         return change
 
     monkeypatch.setattr(probe, "time", SimpleNamespace(perf_counter=look))
-    left = state.cost(state.iteration, state.total)
+    left = cost(state, state.iteration, state.total)
     assert left > 0 and probe.seconds_saved(state, turned(-0.25)) == pytest.approx(0.25 * left)
     assert probe.seconds_saved(state, turned(0.25)) == 0
 

@@ -17,6 +17,7 @@ from refgs.train.learn.light import diffuse, mirrored
 from refgs.train.learn.rates import set_rates
 from refgs.train.setup import start_deferred
 from refgs.train.start import GEOMETRY
+from refgs.train.timeline import Step
 from tests.makers.training import asset_error, learned, trained, trainer
 
 
@@ -29,7 +30,7 @@ def test_the_deferred_stage_keeps_the_geometry_alone(ball_capture, tmp_path):
     before = learned(made)
     assert made.state.initial
     assert not any(torch.equal(before[name], start[name]) for name in ("albedo", "sh_dc", "roughness"))
-    start_deferred(made.state)
+    start_deferred(made.state, Step(made.state))
     assert not made.state.initial
     for name, value in made.state.learned.by_row.items():
         if name in GEOMETRY:
@@ -112,13 +113,13 @@ def test_the_light_diffuses_as_heat_does(ball_capture, tmp_path, waves):
     """
     changes = "needs.initial=on", "environment.diffusion=6.4", "rates.environment=0.5"
     made = trainer(ball_capture, tmp_path / "run", *changes, total=10)
-    set_rates(made.state, 0.0)
+    set_rates(made.state, Step(made.state))
     angle = torch.pi * waves / 16
     wave = torch.cos(angle * (torch.arange(16) + 0.5))
     texels = made.state.learned["environment"].detach().view(6, 16, 16, 3)
     texels[:] = 0.7 + wave[:, None, None]
     texels[1] = 0.7 + wave[:, None]
-    diffuse(made.state)
+    diffuse(made.state, Step(made.state))
     faded = 0.7 + (1 - 4 * 0.2 * torch.sin(torch.tensor(angle / 2)) ** 2) * wave
     for face, expected in ((0, faded[:, None, None]), (1, faded[:, None])):
         assert torch.allclose(texels[face], expected.expand(16, 16, 3), atol=1e-6)
@@ -128,9 +129,9 @@ def test_the_light_fades_to_grey(ball_capture, tmp_path):
     """Check one step: of a texel's colour 0.5 · 0.2 goes, the product of the learning rate and the setting. Its mean stays."""
     changes = "needs.initial=on", "environment.diffusion=0", "environment.grey=0.2", "rates.environment=0.5"
     made = trainer(ball_capture, tmp_path / "run", *changes, total=10)
-    set_rates(made.state, 0.0)
+    set_rates(made.state, Step(made.state))
     made.state.learned["environment"].data[:] = torch.tensor([0.2, 0.5, 1.1])
-    diffuse(made.state)
+    diffuse(made.state, Step(made.state))
     assert torch.allclose(
         made.state.learned["environment"].data, torch.tensor([0.24, 0.51, 1.05]).expand(6 * 16**2, 3), atol=1e-6
     )

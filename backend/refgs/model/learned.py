@@ -143,6 +143,10 @@ class Learned(Mapping[str, Tensor]):
         elif old := self.moments.get(name):
             old.mean[which] = old.square[which] = 0
 
+    def has_learned(self, name: str) -> bool:
+        """Tell whether Adam has taken a step with a tensor since it was set."""
+        return name in self.moments
+
     def gradients(self) -> list[Tensor]:
         """Return the gradients that the last backward pass has computed."""
         return [value.grad for value in self._values.values() if value.grad is not None]
@@ -218,6 +222,24 @@ class Learned(Mapping[str, Tensor]):
     def _kept(self, name: str) -> str:
         """Return the name of a tensor in a checkpoint."""
         return f"parameter.{name}" if name in self._by_row else name
+
+
+def belong_together(tensors: Mapping[str, Tensor]) -> bool:
+    """Tell whether the tensors of a checkpoint are complete, and have the rows and types that belong together."""
+    fine = {"environment", "parameter.position"} <= tensors.keys()
+    rows = tensors["parameter.position"].shape[:1] if fine else ()
+    for name, value in tensors.items():
+        kind, _, rest = name.partition(".")
+        if kind in ("parameter", "constant", "densification"):
+            fine &= value.shape[:1] == ((1,) if kind == "constant" else rows)
+        if kind in ("parameter", "constant", "environment", "exposure"):
+            fine &= value.dtype == (torch.bool if rest == "held" else torch.float32)
+        if kind == "adam":
+            of, _, moment = rest.rpartition(".")
+            learned = tensors.get(of if of in ("environment", "exposure") else f"parameter.{of}")
+            fine &= all(f"adam.{of}.{each}" in tensors for each in ("step", "exp_avg", "exp_avg_sq"))
+            fine &= learned is not None and (value.numel() == 1 if moment == "step" else value.shape == learned.shape)
+    return fine
 
 
 def _leaf(value: Tensor) -> Tensor:

@@ -27,11 +27,6 @@ class Stage(NamedTuple):
 FULL = (Stage(1.0, 1),)
 
 
-def stage_at(progress: float, stages: tuple[Stage, ...]) -> Stage:
-    """Return the stage of a training at a progress of 0..1."""
-    return next(stage for stage in stages if progress < stage.until or stage.until == 1)
-
-
 def iterations_time(growth: float, progress: float, stages: tuple[Stage, ...] = FULL) -> float:
     """Compute how long all iterations up to a progress of 0..1 take together.
 

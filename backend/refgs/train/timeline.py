@@ -13,6 +13,7 @@ from typing import NamedTuple
 from refgs.render.rendering import Rendering
 from refgs.settings import DensifySettings, RateSettings
 from refgs.train.photo import Photo
+from refgs.train.plan import Stage
 from refgs.train.start import GEOMETRY
 from refgs.train.state import State, why_not_traced
 
@@ -187,6 +188,11 @@ def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total:
     )
     opacity = max(opacity, RESET)
     return iterations * rates.opacity < 4 * math.log(opacity / (1 - opacity) * (1 - RESET) / RESET)
+
+
+def stage_at(progress: float, stages: tuple[Stage, ...]) -> Stage:
+    """Return the stage, by its photos' size, of a training at a progress of 0..1."""
+    return next(stage for stage in stages if progress < stage.until or stage.until == 1)
 
 
 def even_by_logarithm(iteration: int) -> bool:

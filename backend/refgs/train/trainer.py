@@ -14,6 +14,7 @@ from refgs.memory import trim
 from refgs.run_folder import CHECKPOINTS
 from refgs.settings import Settings
 from refgs.train.decide import needs, photos
+from refgs.train.decide.need import Given
 from refgs.train.effective import Effective
 from refgs.train.keep import checkpoint, history, snapshot
 from refgs.train.keep.measures import Measures
@@ -28,7 +29,7 @@ from refgs.train.setup import set_up, start_deferred, start_residual
 from refgs.train.state import State
 from refgs.train.timeline import AFTER, BEFORE, CHECKPOINT, PLAN, RECORD, REPORT, WHOLE, Row, Step
 
-ACTIONS: dict[str, Callable[[State, Step], None]] = {
+ACTIONS: dict[str, Callable[[State, Step], object]] = {
     "take larger photos": coarse.refine,
     "start the deferred stage": start_deferred,
     "start the residual": start_residual,
@@ -43,9 +44,9 @@ ACTIONS: dict[str, Callable[[State, Step], None]] = {
     "trace what surfels receive": trace.trace_received,
     "time the crops": photos.time_crops,
     "look at a matte scene again": needs.look_again,
-    "decide on specular shading": needs.specular,
-    "decide on the light's texels": needs.light,
-    "decide on degrees of harmonics": needs.degrees,
+    "decide on specular shading": lambda state, step: needs.evaluate(state, "specular", Given(step.done)),
+    "decide on the light's texels": lambda state, step: needs.evaluate(state, "light"),
+    "decide on degrees of harmonics": lambda state, step: needs.evaluate(state, "degrees"),
     "find metals": metals.find_metals,
     "judge metals": metals.judge,
     "even coloured metal out": even_metal.even_out,
@@ -154,7 +155,7 @@ class Trainer:
                 history.record(state, self.measures)
             if CHECKPOINT.due(state, now):
                 self.save()
-        if state.ended and means.values:
+        if state.ended and state.iteration > first:
             history.record(state, self.measures)
         self.save()
         return state.ended

@@ -40,14 +40,11 @@ __all__ = [
     "CONSTANTS",
     "NEEDS",
     "bring_back_specular",
-    "degrees",
     "evaluate",
-    "light",
     "look_again",
     "reflections",
     "restore",
     "rows",
-    "specular",
 ]
 
 
@@ -65,21 +62,6 @@ def evaluate(state: State, moment: Moment, given: Given = Given()) -> list[str]:
             _record(state, need, decision)
             decided.append(need.name)
     return decided
-
-
-def specular(state: State, step: Step) -> None:
-    """Decide whether the scene needs specular shading, and what follows from that."""
-    evaluate(state, "specular", Given(step.done))
-
-
-def light(state: State, step: Step) -> None:
-    """Decide whether the scene needs all of the light's texels."""
-    evaluate(state, "light")
-
-
-def degrees(state: State, step: Step) -> None:
-    """Decide whether the scene needs all degrees of harmonics."""
-    evaluate(state, "degrees")
 
 
 def look_again(state: State, step: Step) -> None:

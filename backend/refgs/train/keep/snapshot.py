@@ -7,6 +7,7 @@ import torch
 from refgs.errors import InputError
 from refgs.formats.checkpoint import Facts
 from refgs.formats.validate import validated
+from refgs.model.learned import belong_together
 from refgs.train.decide import needs
 from refgs.train.keep import checkpoint
 from refgs.train.part import Fact
@@ -39,7 +40,8 @@ def restore(state: State, run: Path) -> None:
     """
     tensors, tables = checkpoint.load(run / "checkpoints", state.report)
     facts = validated(tables, Facts, str(run / "checkpoints"), "Train again into a new folder.")
-    _check_tensors(tensors, run)
+    if not belong_together(tensors):
+        raise InputError(f"{run / 'checkpoints'}: the tensors of the checkpoint do not belong together: train again")
     state.total = facts.total
     needs.restore(state, facts.needs)
     tensors = {name: value.to(state.device) for name, value in tensors.items()}
@@ -57,22 +59,3 @@ def restore(state: State, run: Path) -> None:
             part.restore(state, facts.parts.get(part.name, {}) | own)
     except KeyError:
         raise InputError(f"{run} was begun by another release of RefGS: train again into a new folder") from None
-
-
-def _check_tensors(tensors: dict[str, torch.Tensor], run: Path) -> None:
-    """Raise InputError if tensors of a checkpoint are missing, or do not belong together: they have other rows or types."""
-    fine = {"environment", "parameter.position"} <= tensors.keys()
-    rows = tensors["parameter.position"].shape[:1] if fine else ()
-    for name, value in tensors.items():
-        kind, _, rest = name.partition(".")
-        if kind in ("parameter", "constant", "densification"):
-            fine &= value.shape[:1] == ((1,) if kind == "constant" else rows)
-        if kind in ("parameter", "constant", "environment", "exposure"):
-            fine &= value.dtype == (torch.bool if rest == "held" else torch.float32)
-        if kind == "adam":
-            of, _, moment = rest.rpartition(".")
-            learned = tensors.get(of if of in ("environment", "exposure") else f"parameter.{of}")
-            fine &= all(f"adam.{of}.{each}" in tensors for each in ("step", "exp_avg", "exp_avg_sq"))
-            fine &= learned is not None and (value.numel() == 1 if moment == "step" else value.shape == learned.shape)
-    if not fine:
-        raise InputError(f"{run / 'checkpoints'}: the tensors of the checkpoint do not belong together: train again")

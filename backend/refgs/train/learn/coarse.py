@@ -11,9 +11,9 @@ from refgs.capture import LoadedView, reduced_views
 from refgs.run_folder import PHOTOS
 from refgs.train.part import Part
 from refgs.train.photo import MARGIN, Crop, Photo, crop_of
-from refgs.train.plan import FULL, Stage, iterations_time, stage_at
+from refgs.train.plan import FULL, Stage, iterations_time
 from refgs.train.state import State
-from refgs.train.timeline import PHOTO_STAGES, POSES_KNOWN, Step
+from refgs.train.timeline import PHOTO_STAGES, POSES_KNOWN, Step, stage_at
 
 LEAST_SPAN = 200  # pixels of the object in reduced photos
 

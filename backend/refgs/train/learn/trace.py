@@ -66,7 +66,7 @@ def make_mesh(state: State, step: Step) -> None:
             hidden += float((1 - seen.visibility)[opaque].sum()) if seen.visibility is not None else 0.0
             solid += float(opaque.sum())
         step.hidden = hidden / solid
-        if "indirect_dc" not in state.learned.moments:
+        if not state.learned.has_learned("indirect_dc"):
             # Start from the light that the surfels mirrored until now, so that the picture changes little.
             start, rest = inputs.light.harmonics, state.learned["indirect_rest"]
             state.learned["indirect_dc"][:], rest[:] = start[:1], start[1 : 1 + rest.shape[1]]
