@@ -93,11 +93,13 @@ inline void prepare(int n) {
     getcontext(&t.start);
     t.start.uc_stack.ss_sp = malloc(STACK), t.start.uc_stack.ss_size = STACK, t.start.uc_link = nullptr;
     current = prepared;
+    // clang-format off
     makecontext(&t.start, (void (*)())+[] {
       int me = current;
       if (!_setjmp(threads[me].here)) setcontext(&back);
       fibre();
     }, 0);
+    // clang-format on
     swapcontext(&back, &t.start);
   }
 }
@@ -153,11 +155,11 @@ inline unsigned ballot(bool vote) {
 #define blockDim (emulator::block_size)
 #define gridDim (emulator::grid_size)
 
-#define KERNEL(name, Work, w, ...)                                                                \
-  static void name##_threads(const Work* w);                                                      \
-  extern "C" void name(const void* work, int blocks, int threads) {                               \
+#define KERNEL(name, Work, w, ...)                                                                  \
+  static void name##_threads(const Work* w);                                                        \
+  extern "C" void name(const void* work, int blocks, int threads) {                                 \
     emulator::launch(blocks, threads, [](const void* w) { name##_threads((const Work*)w); }, work); \
-  }                                                                                               \
+  }                                                                                                 \
   static void name##_threads(const Work* w)
 
 inline void __syncthreads() { emulator::wait(emulator::block); }

@@ -16,11 +16,9 @@ typedef unsigned long long uint64_t;
 
 // Define a kernel. It takes its work by value, and `w` points at it. Launch bounds may follow.
 #ifndef KERNEL
-#define KERNEL(name, Work, w, ...)                                                 \
-  static void name##_threads(const Work* w);                                       \
-  extern "C" __global__ void __VA_ARGS__ name(const __grid_constant__ Work work) { \
-    name##_threads(&work);                                                         \
-  }                                                                                \
+#define KERNEL(name, Work, w, ...)                                                                          \
+  static void name##_threads(const Work* w);                                                                \
+  extern "C" __global__ void __VA_ARGS__ name(const __grid_constant__ Work work) { name##_threads(&work); } \
   static void name##_threads(const Work* w)
 #endif
 

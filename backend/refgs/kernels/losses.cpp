@@ -20,7 +20,8 @@ struct Losses {
   const float* background;                                 // (3)
   float white, largest;                                    // codes: of 1; of a clipped pixel
   float rotation[9], across, down, left, top;              // world to camera; at depth 1: a pixel's size, the first pixel's position
-  float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, even_x_weight, even_y_weight, alpha_weight, metallic_weight, dark_weight, matte_weight;
+  float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, even_x_weight, even_y_weight, alpha_weight, metallic_weight, dark_weight,
+      matte_weight;
   float *photo, *clipped;   // (H, W, 3) the photo over the background; the clipped C, for D-SSIM
   const float* by_clipped;  // (H, W, 3) derivatives of D-SSIM by `clipped`
   float *by_color, *by_normal, *by_depth, *by_alpha, *by_material;
@@ -184,7 +185,8 @@ INLINE void smooth_term(const Row& r, int dx, int dy, float smooth, float even, 
   Vector w = smooth * kept, by_even = even * kept, cost = w * (magnitude(n.x) + magnitude(n.y) + magnitude(n.z));
   by_normal = by_normal + Vectors{w * sign(n.x), w * sign(n.y), w * sign(n.z)};
   for (int i = 0; i < 2 && even != 0; i++) {
-    Vector m = r.at.get(r.of(l.material, MATERIAL) + METAL + i, MATERIAL) - r.at.beside(dx).get(r.of(l.material, MATERIAL, dy) + METAL + i, MATERIAL);
+    Vector m =
+        r.at.get(r.of(l.material, MATERIAL) + METAL + i, MATERIAL) - r.at.beside(dx).get(r.of(l.material, MATERIAL, dy) + METAL + i, MATERIAL);
     Vector slope = clamp(m * (1 / FLAT), -1, 1);  // Huber loss: in even regions the sign of rounding errors must not matter
     cost += by_even * slope * (m - 0.5f * FLAT * slope), by_material[i] += by_even * slope;
   }
@@ -219,7 +221,7 @@ void each(const Losses* l, Body body) {
 
 // First pass: terms of a pixel by itself, and the normal term, which reads the depths around it.
 KERNEL(refgs_losses_first, Losses, l) {
-  each(l, [](const Row& r, Sum (&sums)[SUMS]) {
+  each(l, [](const Row& r, Sum(&sums)[SUMS]) {
     pixel_terms(r, sums);
     normal_term(r, sums[LOSS]);
   });
@@ -227,7 +229,7 @@ KERNEL(refgs_losses_first, Losses, l) {
 
 // Second pass: terms between neighbours, and derivatives that come from the neighbours' normal terms.
 KERNEL(refgs_losses_second, Losses, l) {
-  each(l, [](const Row& r, Sum (&sums)[SUMS]) {
+  each(l, [](const Row& r, Sum(&sums)[SUMS]) {
     const Losses& l = r.l;
     Vectors by_normal = r.get3(l.by_normal);
     Vector by_smooth[2] = {};  // of metallic and roughness

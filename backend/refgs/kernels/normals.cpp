@@ -55,8 +55,8 @@ KERNEL(refgs_normals_forward, Normals, s) {
 KERNEL(refgs_normals_backward, Normals, s) {
   each(s, [&](int64_t i, const Turned& t) {
     const float *g = s->by_normals + 3 * i, *q = t.q;
-    float by[4] = {q[2] * g[0] - q[1] * g[1], q[3] * g[0] - q[0] * g[1] - 2 * q[1] * g[2],
-                   q[0] * g[0] + q[3] * g[1] - 2 * q[2] * g[2], q[1] * g[0] + q[2] * g[1]};
+    float by[4] = {q[2] * g[0] - q[1] * g[1], q[3] * g[0] - q[0] * g[1] - 2 * q[1] * g[2], q[0] * g[0] + q[3] * g[1] - 2 * q[2] * g[2],
+                   q[1] * g[0] + q[2] * g[1]};
     float along = 0;
     for (int k = 0; k < 4; k++) along += by[k] * q[k];
     for (int k = 0; k < 4; k++) s->by_rotations[4 * i + k] = 2 * t.sign * t.inverse * (by[k] - along * q[k]);

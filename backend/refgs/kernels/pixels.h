@@ -32,7 +32,7 @@ struct Shade {
   const int32_t *starts, *cell;   // cells of texel i: cell[starts[i]] up to, not including, cell[starts[i + 1]]
   const float* reflectance;       // (reflectance_side, reflectance_side, 4)
   int64_t reflectance_side;
-  float *mirrored;                                        // (height, width, 3)
+  float* mirrored;                                        // (height, width, 3)
   float *color, *normal, *material, *radiance;            // (height, width, 3 | 3 | 5 | 3)
   const float *by_color, *by_normal, *by_material;
   float *by_features, *by_alpha;
@@ -54,9 +54,7 @@ struct Pixels {
   int32_t at[LANES];
   alignas(64) float column[LANES], row[LANES], alpha[LANES];
 
-  MEMBER void set(int k, int64_t i, int64_t x, int64_t y, float a) {
-    at[k] = (int32_t)i, column[k] = (float)x, row[k] = (float)y, alpha[k] = a;
-  }
+  MEMBER void set(int k, int64_t i, int64_t x, int64_t y, float a) { at[k] = (int32_t)i, column[k] = (float)x, row[k] = (float)y, alpha[k] = a; }
 };
 
 // Call body(pixels) for all covered pixels from i up to `end`.
@@ -105,9 +103,7 @@ struct Corners {
   Vector x, y;  // bilinear weights of the next column and row
 
   MEMBER int64_t at(int k, int j) const { return first[k] + (j & 1 ? next : 0) + (j & 2 ? below : 0); }
-  MEMBER void weights(Vector (&w)[4]) const {
-    w[0] = (1.0f - x) * (1.0f - y), w[1] = x * (1.0f - y), w[2] = (1.0f - x) * y, w[3] = x * y;
-  }
+  MEMBER void weights(Vector (&w)[4]) const { w[0] = (1.0f - x) * (1.0f - y), w[1] = x * (1.0f - y), w[2] = (1.0f - x) * y, w[3] = x * y; }
 };
 
 }  // namespace

@@ -172,7 +172,8 @@ INLINE void project(const Scene& r, int64_t first, Each each) {
     value[j] = rows[j].z - slope_x[j] * r.cx - slope_y[j] * r.cy;
   }
   Real determinant = d.determinant * d.k;
-  Real n2_min = proper ? larger(determinant * (1 / refgs::FAR), Real() + 1e-18) : Real() + 1, n2_max = proper ? determinant * (1 / r.near) : Real() - 1;
+  Real n2_min = proper ? larger(determinant * (1 / refgs::FAR), Real() + 1e-18) : Real() + 1,
+       n2_max = proper ? determinant * (1 / r.near) : Real() - 1;
   for (int lane = 0; lane < BATCH && first + lane < r.splats; lane++) {
     Octagon o = {0, -1};
     if (!visible[lane]) {
@@ -213,9 +214,7 @@ INLINE void carry(const Scene& r, int64_t first, const Sums& sums) {
   if (any_touched) {
     d = disc(r, i);
     double per_fx = 1 / r.fx, per_fy = 1 / r.fy;
-    auto raw = [&](const Real* g) {
-      return Vec3{d.k * (g[1] - g[0] * r.cx) * per_fx, d.k * (g[2] - g[0] * r.cy) * per_fy, d.k * g[0]};
-    };
+    auto raw = [&](const Real* g) { return Vec3{d.k * (g[1] - g[0] * r.cx) * per_fx, d.k * (g[2] - g[0] * r.cy) * per_fy, d.k * g[0]}; };
     Real determinant = sums.determinant * d.k, x = sums.x * r.fx * d.per_z, y = sums.y * r.fy * d.per_z;
     Vec3 g0 = (Real() + 1 / refgs::UNIT) * raw(sums.n[0]), g1 = (Real() + 1 / refgs::UNIT) * raw(sums.n[1]);
     Vec3 g2 = raw(sums.n[2]) + determinant * d.c;

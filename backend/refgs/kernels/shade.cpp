@@ -393,9 +393,7 @@ KERNEL(refgs_shade_backward, Shade, s) {
 }
 
 KERNEL(refgs_shade_gather, Shade, s) {
-  share(s->shared, s->height + s->lines, 8, [&](int64_t k) {
-    k < s->height ? add_near(*s, k) : add_line(*s, (int32_t)(k - s->height));
-  });
+  share(s->shared, s->height + s->lines, 8, [&](int64_t k) { k < s->height ? add_near(*s, k) : add_line(*s, (int32_t)(k - s->height)); });
 }
 
 KERNEL(refgs_shade_unpad, Shade, s) {

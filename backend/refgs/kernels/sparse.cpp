@@ -59,8 +59,7 @@ INLINE void product(const Product& p) {
       float images[WIDTH + 1];
       for (int v = 0; v < VECTORS; v++) *(UnalignedVector*)(images + v * LANES) = run[v];
       if (REST) *(UnalignedRest*)(images + VECTORS * LANES) = rest;
-      for (int s = 0; s < SYMMETRIES; s++)
-        sums[s] += *(const UnalignedFour*)(images + 3 * p.compositions[SYMMETRIES * symmetry + s]);
+      for (int s = 0; s < SYMMETRIES; s++) sums[s] += *(const UnalignedFour*)(images + 3 * p.compositions[SYMMETRIES * symmetry + s]);
     }
     for (int s = 0; s < SYMMETRIES; s++)
       for (int c = 0; c < 3; c++) p.out[3 * p.place(SYMMETRIES * orbit + s) + c] = sums[s][c];

@@ -117,9 +117,8 @@ KERNEL(refgs_ssim_forward, Ssim, s) {
 KERNEL(refgs_ssim_backward, Ssim, s) {
   __shared__ float lines[3][ROWS][THREADS];
   Column column(*s);
-  column.down(lines, [&](int64_t at, float (&values)[3]) {
-    values[0] = s->by_mean[at], values[1] = s->by_square[at], values[2] = s->by_product[at];
-  });
+  column.down(lines,
+              [&](int64_t at, float (&values)[3]) { values[0] = s->by_mean[at], values[1] = s->by_square[at], values[2] = s->by_product[at]; });
   column.each([&](int64_t at, int row) {
     Vector v[3];
     for (int i = 0; i < 3; i++) v[i] = along(&lines[i][row][threadIdx.x]);
