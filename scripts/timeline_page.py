@@ -8,7 +8,7 @@ from refgs.train.timeline import Row
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "timeline.md"
 HEAD = """# When what is done in a training
 
-<!-- Written by `python scripts/timeline_page.py` from backend/refgs/train/timeline.py. -->
+<!-- Written by `python -m scripts.timeline_page` from backend/refgs/train/timeline.py. -->
 
 An iteration renders one photo and learns from it. Before and after that, the rows below are done, in this order, when they are due. Parts
 of the training (20%) are parts of its iterations. A word such as `densify.every` is a [setting](settings.md).

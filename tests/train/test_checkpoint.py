@@ -6,8 +6,12 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from refgs.errors import InputError
+from refgs.model.surfels import raw_metallic
 from refgs.train.keep import checkpoint
+from refgs.train.keep.earlier import RENAMED, as_of_today
+from refgs.train.material.metals import HELD, Metals
 from tests.makers.mutants import put_link
+from tests.makers.training import put, trainer
 
 
 def test_the_last_two_are_kept(tmp_path):
@@ -115,6 +119,27 @@ def test_one_of_an_earlier_release_has_no_hash(tmp_path):
     (tmp_path / "00000010.toml").write_text(tomli_w.dumps({"iteration": 10, "total": 30}))
     tensors, facts = checkpoint.load(tmp_path)
     assert tensors["x"].tolist() == [1, 1] and facts == {"iteration": 10, "total": 30}
+
+
+def test_one_of_0_1_0_is_read_as_one_of_today(ball_capture, tmp_path):
+    """Write a checkpoint as 0.1.0 did, which had other names and knew held surfels by their metallic, and check that nothing is lost."""
+    made = trainer(ball_capture, tmp_path / "run", "cameras.poses=on", "light.exposure=on", total=40)
+    for _ in range(5):
+        made.step()
+    held = torch.arange(made.state.learned.count) % 3 == 0
+    put(made, held=held, metallic=torch.where(held, raw_metallic(HELD.metal), 0.3))
+    made.state.part(Metals).found = True
+    made.save()
+    tensors, facts = checkpoint.load(tmp_path / "run" / "checkpoints")
+    earlier = {name: value for name, value in tensors.items() if name != "parameter.held"}
+    earlier |= {old: earlier.pop(new) for old, new in RENAMED.items() if new in earlier}
+    old = {name: value for name, value in facts.items() if name not in ("residual", "clock", "parts")}
+    old |= {"parts": facts["clock"], "metals_set": True, "poses_judged": False, "reduced": 1}
+    found, known = as_of_today(earlier, old)
+    assert {name for name in tensors if not name.startswith("means.")} <= found.keys()
+    assert all(torch.equal(found[name], tensors[name]) for name in found)
+    assert known | {"parts": facts["parts"]} == facts | {key: old[key] for key in old.keys() - facts.keys()}
+    assert all(known["parts"][name] == facts["parts"][name] for name in ("metals", "poses", "coarse"))
 
 
 def test_what_a_kill_between_two_files_left_is_removed(tmp_path):

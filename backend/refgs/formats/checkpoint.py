@@ -20,7 +20,7 @@ class Facts(Model):
     iteration: Count
     total: Count
     seconds: Seconds
-    initial: bool
+    initial: bool | None = None  # 0.1.0 had no such stage
     residual: bool
     spent: Seconds
     processor_seconds: Seconds

@@ -10,6 +10,7 @@ from refgs.formats.validate import validated
 from refgs.model.learned import belong_together
 from refgs.train.decide import needs
 from refgs.train.keep import checkpoint
+from refgs.train.keep.earlier import as_of_today
 from refgs.train.part import Fact
 from refgs.train.state import State
 
@@ -38,7 +39,7 @@ def restore(state: State, run: Path) -> None:
 
     Raises `checkpoint.NoCheckpoint` if there is none, and InputError if another release of RefGS wrote it.
     """
-    tensors, tables = checkpoint.load(run / "checkpoints", state.report)
+    tensors, tables = as_of_today(*checkpoint.load(run / "checkpoints", state.report))
     facts = validated(tables, Facts, str(run / "checkpoints"), "Train again into a new folder.")
     if not belong_together(tensors):
         raise InputError(f"{run / 'checkpoints'}: the tensors of the checkpoint do not belong together: train again")
@@ -48,7 +49,8 @@ def restore(state: State, run: Path) -> None:
     state.iteration, state.seconds = facts.iteration, facts.seconds
     state.clock.resume(facts.clock, facts.processor_seconds)
     state.plan.before = facts.spent
-    state.initial, state.residual = facts.initial, facts.residual
+    state.initial = state.initial if facts.initial is None else facts.initial
+    state.residual = facts.residual
     for about, what in facts.decided.items():
         state.announce(about, what)
     try:

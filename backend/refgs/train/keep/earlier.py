@@ -1,0 +1,39 @@
+"""Read checkpoints of earlier releases as if today's had written them."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from refgs.model.surfels import raw_metallic
+from refgs.train.material.metals import HELD
+
+RENAMED = {
+    "poses": "poses.values",
+    "mirrored": "light.weight",
+    "motion.total": "densification.total",
+    "motion.views": "densification.views",
+}
+
+
+def as_of_today(tensors: dict[str, Tensor], facts: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Return the tensors and facts of a checkpoint in today's form.
+
+    0.1.0 knew held surfels by the value of their metallic, and kept the facts of each part under a name of their own.
+    """
+    if "residual" in facts:
+        return tensors, facts
+    tensors = {RENAMED.get(name, name): value for name, value in tensors.items()}
+    if (metallic := tensors.get("parameter.metallic")) is not None:
+        tensors["parameter.held"] = torch.isin(metallic, torch.tensor([raw_metallic(value) for value in HELD]))
+    elif "constant.metallic" in tensors:
+        tensors["constant.held"] = torch.zeros(1, dtype=torch.bool)
+    harmonics = tensors.get("parameter.sh_rest")
+    known = {"spent": facts.get("seconds", 0.0), "processor_seconds": 0.0, "decided": {}, "needs": {}} | facts
+    known |= {"residual": harmonics is not None and bool(harmonics.any()), "clock": facts.get("parts", {})}
+    known["parts"] = {
+        "metals": {"found": facts.get("metals_set", True)},
+        "poses": {"judged": facts.get("poses_judged", True)},
+        "coarse": {"factor": facts.get("reduced", 1)},
+    }
+    return tensors, known
