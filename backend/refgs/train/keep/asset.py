@@ -40,69 +40,57 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
 
     A run that has splats.ply has ended. So this file is written last, after a call of `before_splats`.
     """
-    folder, settings = state.folder, state.settings
     with torch.no_grad():
-        surfels, environment = with_normals_last(state.surfels()), state.environment()
-    if not surfels.sh_rest.any():  # the training ended before they could learn
-        surfels = surfels.without_directions()
-    if state.occluder is None:
-        nothing, whole = surfels.indirect_dc[:, :0], torch.ones_like(surfels.received)
-        surfels = surfels._replace(indirect_dc=nothing, indirect_rest=nothing, received=whole)
-    else:
-        write_mesh(folder / OCCLUDER, state.occluder.mesh)
-    if environment is not None:
-        panorama = environment.panorama(4 * environment.resolution)
-        write_exr(folder / "environment.exr", state.method.light.to_linear(panorama))
-        surfels = _with_relightable_albedo(surfels, environment, state)
+        surfels = with_normals_last(state.surfels())
+    for rewrite in REWRITES:
+        surfels = rewrite(surfels, state)
     side, wanted = _seen_side(surfels, state), state.wanted()
     kept = wanted & (side != 0)
     if not kept.any():
         raise InputError(
             "the photos show nothing in the region: move its box, or enlarge it, and train into a new folder"
         )
-    constants = _constant_columns(state, surfels, kept)
-    for name in {*constants} & {*Surfels._fields}:
-        surfels = surfels._replace(**{name: torch.full_like(getattr(surfels, name), constants[name])})
+    surfels, constants = _with_constants(surfels, state, kept)
     splats = to_splats(surfels.chosen(kept))
     splats.constants = constants
     if found := metals.doubt(state):
         doubt, facts = found
         splats.doubt = doubt.numpy()[kept.numpy(force=True)]
-        update_metrics(folder, {"doubt": facts})
+        update_metrics(state.folder, {"doubt": facts})
     splats.normals *= side[kept].numpy(force=True)[:, None]
     splats.normals = blended_normals(splats)
-    factors = exposure(state, slice(None))
-    refined = state.part(Poses).values is not None
-    if factors is not None or refined:
-        exposures = None
-        if factors is not None:
-            exposures = {view.camera.name: factor for view, factor in zip(state.views, factors.tolist(), strict=True)}
-        write_cameras(folder / "cameras.json", poses.refined(state), settings.light.frame, exposures, refined)
-    write_text(folder / "needs.json", json.dumps(_needs_rows(state, surfels, side, wanted), indent=1))
+    _write_light_and_mesh(state)
+    _write_refined_cameras(state)
+    write_text(state.folder / "needs.json", json.dumps(_needs_rows(state, surfels, side, wanted), indent=1))
     before_splats()
-    write_splats(folder / SPLATS, splats)
+    write_splats(state.folder / SPLATS, splats)
 
 
-def _constant_columns(state: State, surfels: Surfels, kept: Tensor) -> dict[str, float]:
-    """Find out which of metallic, roughness and specular have about the same value for all surfels. Return these values by name.
-
-    splats.ply then needs no column for them. Only surfels whose entry in `kept` (N,) is true are compared.
-    """
-    if state.settings.render.reflection == "none" and state.method.lit:
-        return {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
-    common = needs.CONSTANTS.common(state, surfels, kept)
-    needs.evaluate(state, "asset", Given(state.iteration, common=common, kept=int(kept.sum())))
-    return {name: value for name, (value, _) in common.items()}
+def _without_unlearned(surfels: Surfels, state: State) -> Surfels:
+    """Drop the residual if the training ended before it could learn."""
+    return surfels if surfels.sh_rest.any() else surfels.without_directions()
 
 
-def _with_relightable_albedo(surfels: Surfels, environment: Environment, state: State) -> Surfels:
-    """Return surfels that have both an albedo and SH colours.
+def _without_untraced(surfels: Surfels, state: State) -> Surfels:
+    """Drop inter-reflection if the training has traced none."""
+    if state.occluder is not None:
+        return surfels
+    nothing, whole = surfels.indirect_dc[:, :0], torch.ones_like(surfels.received)
+    return surfels._replace(indirect_dc=nothing, indirect_rest=nothing, received=whole)
+
+
+@torch.no_grad()
+def _with_relightable_albedo(surfels: Surfels, state: State) -> Surfels:
+    """Return surfels that have both an albedo and SH colours, if the scene has a light.
 
     Programs that light the surfels use the albedo. Programs that display the surfels without lighting use the SH colours.
 
     If the training learned diffuse colour as SH, compute the albedo: the mean SH colour divided by the irradiance, or for metals the
     learned reflectance. If the training learned the albedo, compute the SH colour: the albedo times the irradiance.
     """
+    environment = state.environment()
+    if environment is None:
+        return surfels
     received = _irradiance(surfels, environment, state)
     metallic = surfels.metallic[:, None]
     if state.settings.render.diffuse == "sh":
@@ -111,6 +99,47 @@ def _with_relightable_albedo(surfels: Surfels, environment: Environment, state: 
         return surfels._replace(albedo=albedo)
     look = state.method.light.encode((surfels.albedo * received).clamp(0, 1))
     return surfels._replace(sh_dc=((look - 0.5) / harmonics.DC)[:, None])
+
+
+REWRITES = (_without_unlearned, _without_untraced, _with_relightable_albedo)
+"""What becomes of the surfels, in this order: base colours take into account what was traced of `received`."""
+
+
+def _with_constants(surfels: Surfels, state: State, kept: Tensor) -> tuple[Surfels, dict[str, float]]:
+    """Give all surfels the same metallic, roughness or specular where these are about the same. Return these values by name, too.
+
+    splats.ply then needs no column for them. Only surfels whose entry in `kept` (N,) is true are compared.
+    """
+    if state.settings.render.reflection == "none" and state.method.lit:
+        constants = {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
+    else:
+        common = needs.CONSTANTS.common(state, surfels, kept)
+        needs.evaluate(state, "asset", Given(state.iteration, common=common, kept=int(kept.sum())))
+        constants = {name: value for name, (value, _) in common.items()}
+    same = {name: constants[name] for name in {*constants} & {*Surfels._fields}}
+    return surfels._replace(**{n: torch.full_like(getattr(surfels, n), value) for n, value in same.items()}), constants
+
+
+def _write_light_and_mesh(state: State) -> None:
+    """Write environment.exr if there is a light, and occluder.ply if inter-reflection was traced."""
+    if state.occluder is not None:
+        write_mesh(state.folder / OCCLUDER, state.occluder.mesh)
+    with torch.no_grad():
+        if (environment := state.environment()) is not None:
+            panorama = environment.panorama(4 * environment.resolution)
+            write_exr(state.folder / "environment.exr", state.method.light.to_linear(panorama))
+
+
+def _write_refined_cameras(state: State) -> None:
+    """Write cameras.json again if exposures or poses were learned."""
+    factors, refined = exposure(state, slice(None)), state.part(Poses).values is not None
+    if factors is None and not refined:
+        return
+    exposures = None
+    if factors is not None:
+        exposures = {view.camera.name: factor for view, factor in zip(state.views, factors.tolist(), strict=True)}
+    frame = state.settings.light.frame
+    write_cameras(state.folder / "cameras.json", poses.refined(state), frame, exposures, refined)
 
 
 def _irradiance(surfels: Surfels, environment: Environment, state: State) -> Tensor:
