@@ -1,4 +1,4 @@
-"""Build what colours a run by its doubt: how little its photos tell metal from paint, 0..1."""
+"""Build the material that colours a run by its doubt: 0 where photos tell metal from paint, 1 where they do not."""
 
 import bpy
 

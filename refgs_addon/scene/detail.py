@@ -11,7 +11,9 @@ LEVELS = (1.0, 0.25, 0.05)  # parts of the splats and triangles
 
 
 def set_detail(collection: bpy.types.Collection, level: float) -> None:
-    """Show a part of a run's splats, enlarged to cover the same, and of its mesh's triangles. `level` is 0 to 1, 1 for all."""
+    """Show only a part of a run's splats and of its mesh's triangles. `level` is that part, 0 to 1.
+
+    The splats that are shown are enlarged, so that they cover the same surface."""
     found = parts(collection)
     for splats in found.get("splats", []):
         if SPLATS in splats.modifiers:

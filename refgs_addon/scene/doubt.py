@@ -33,7 +33,9 @@ def doubt_shown(collection: bpy.types.Collection) -> bool:
 
 
 def show_doubt(collection: bpy.types.Collection, on: bool) -> None:
-    """Colour a run's splats and mesh, unlit: orange where photos do not tell metal from paint, grey where they do; or undo it.
+    """Colour a run's splats and mesh by their doubt, without lighting, or undo that.
+
+    They are orange where photos do not tell metal from paint, and grey where they do.
 
     The mesh has the run folder's texture of doubt. Raises InputError if the mesh is shown and there is no such texture.
     """

@@ -179,7 +179,7 @@ def _read(path: Path, width: int, height: int, turns: int = 0) -> "np.ndarray":
 
 
 def _read_photo(path: Path, width: int, height: int) -> "np.ndarray":
-    """Read a photo upright, in a size: RGBA, top row first."""
+    """Read a photo, turned upright and resized, as RGBA. The top row comes first."""
     return _read(path, width, height, TURNS.get(exif_orientation(path), 0))
 
 

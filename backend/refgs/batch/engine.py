@@ -136,7 +136,7 @@ class Engine:
 
     @contextmanager
     def lending(self, folder: Path) -> Iterator[None]:
-        """Have the files of all steps copied, for a `with` block, to machines that do not share `folder`, that of the batch's logs.
+        """Let machines that do not share the `folder` of the batch's logs copy the files of all steps, for a `with` block.
 
         After the block, the copies are removed; if it raises an error, they stay for the next batch.
         """

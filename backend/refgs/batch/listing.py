@@ -18,7 +18,7 @@ LIBRARY = "library"  # the folder in RUNS in which Blender makes the runs assets
 
 
 class Ask(BaseModel):
-    """Say how to train, as the options of `refgs train` do. A value that is None is decided by the line above."""
+    """Hold the options of `refgs train` for a capture. Where a value is None, the capture takes that of the level above it in the list."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     preset: str | None = None

@@ -160,7 +160,7 @@ def with_masks(
 
 
 def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, float]:
-    """Guess a box about the object: a cube about where the cameras look.
+    """Guess a box around the object: a cube around the point at which the cameras look.
 
     Return the box, the part of it that the object is likely to fill, and the radius of the region of interest. `views` are the capture's,
     without masks that should not count. Raises InputError if the cameras look outwards, as in a room.

@@ -1,4 +1,4 @@
-"""Describe progress.json, in a run folder while a training runs, and what a batch records of a step that has ended."""
+"""Describe two files: progress.json in the run folder of a running training, and the record of a batch's step that has ended."""
 
 from refgs.formats.checkpoint import Count, Seconds
 from refgs.formats.validate import Model

@@ -48,7 +48,7 @@ class RunFile(Model):
 
 
 class Summary(Model):
-    """Hold what the report page shows of a run.toml, by which runs are told apart: values of any release."""
+    """Hold the values of a run.toml by which the report page tells runs apart. Any release may have written them."""
 
     run: dict[str, Value] = Field(default_factory=dict)
     settings: dict[str, dict[str, Value | list[Value]]] = Field(default_factory=dict)

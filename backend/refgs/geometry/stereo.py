@@ -80,7 +80,9 @@ class DepthMap(NamedTuple):
     weight: np.ndarray
 
     def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Look up world points (N, 3): the surface's depth in their pixels, its weight, 0 beyond the picture, and the points' own depth."""
+        """Look up world points (N, 3). Returns the surface's depth in their pixels, its weight, and the points' own depth.
+
+        The weight is 0 beyond the picture."""
         pixels, away = project(self.camera, points)
         on = inside(self.camera, pixels, away)
         column, row = np.where(on[:, None], pixels, 0).astype(int).T

@@ -211,7 +211,7 @@ def specular_explains(state: State) -> Lost:
 
 
 def mirroring_itself(inputs: RenderInputs, radiance: Tensor) -> RenderInputs:
-    """Return inputs for rendering the linear `radiance` (3,) where the object hides the light from what mirrors it."""
+    """Return inputs in which the object mirrors the linear `radiance` (3,) of itself: wherever it hides the light from a mirror ray."""
     surfels = inputs.surfels
     constant = surfels._replace(
         indirect_dc=(radiance / DC).expand_as(surfels.indirect_dc),

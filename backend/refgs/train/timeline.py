@@ -210,7 +210,7 @@ def _late(state: State, part: float) -> float:
 
 
 def _resets(state: State, step: Step) -> bool:
-    """Tell whether opacities may be reset: before `densify.stop`, by the iterations that are done, and if no normals are propagated."""
+    """Tell whether opacities may be reset: before `densify.stop`, and not in an iteration that propagates normals."""
     return step.done / state.total < state.settings.densify.stop and since_propagation(state, step.done) != 0
 
 

@@ -85,7 +85,7 @@ def _bring_back_specular(state: State, decision: Decision) -> None:
 
 
 def _undo_following(state: State, decisions: dict[str, Found], why: str) -> None:
-    """Take back those of the `decisions` that followed from the one on specular shading, if no setting asked for them."""
+    """Take back the `decisions` that were made because the scene was found matte. Those that a setting asked for stay."""
     for need in NEEDS:
         if need.follows == SPECULAR.name and need.name in decisions and need.asked(state) == "auto":
             del decisions[need.name]

@@ -36,7 +36,7 @@ METAL_TINT = 0.6  # tint of the change (0: grey as a dielectric's reflection; 1:
 class Shining(NamedTuple):
     """Tell which surfels (N,) change with the view in their own colour.
 
-    - `clearly`: those that change by CHANGES of their mean radiance, or by FAINT_CHANGES beside such.
+    - `clearly`: those that change by CHANGES of their mean radiance. Their neighbours need only FAINT_CHANGES.
     - `faintly`: those that change by FAINTEST_CHANGES.
     - `tells`: those that are coloured and seen well enough to tell.
     """

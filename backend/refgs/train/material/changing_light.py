@@ -1,4 +1,4 @@
-"""Tell what mirrors a light that stands still from what is matte, under a light that changes from photo to photo.
+"""Tell mirroring surfaces from matte ones whose light changes from photo to photo.
 
 Clouds, a lamp that is carried along, or the photographer's shadow change the radiance of a matte surface along its own colour, as a
 coloured metal changes with the view. In each photo, such a change is nearly linear in the surface's normal (Ramamoorthi and Hanrahan 2001),
