@@ -93,7 +93,8 @@ def test_it_goes_on_after_an_error_and_after_a_rest(time, watch):
         with pytest.raises(RuntimeError), watch.iteration(0):
             draw()
     assert watch.seconds == {"raster": 2} and clock._watching is None
-    watch.resume({"raster": 3.0, "writing": 1.0})
+    watch.resume({"raster": 3.0, "writing": 1.0}, 2.0)
+    assert watch.processor == 2.0
     assert watch.seconds == {"raster": 5, "writing": 1}
 
 

@@ -17,7 +17,7 @@ from refgs.train.start import AROUND
 from refgs.train.state import State
 from refgs.train.timeline import DIVIDE, RESET, Step
 
-KEPT = 0.8  # of the surfels, where there is no memory for all
+LEFT_SURFELS = 0.8  # of the surfels, where there is no memory for all
 LEAST_LEFT = 1000
 
 
@@ -129,11 +129,11 @@ def full_card() -> TryAgain:
 
 
 def fewer_surfels(state: State) -> None:
-    """Keep only the most opaque surfels, the fraction KEPT of all, because the graphics card's memory is full.
+    """Keep only the most opaque surfels, the fraction LEFT_SURFELS of all, because the graphics card's memory is full.
 
     The surfel budget is lowered to the same number. Raises TryAgain if fewer than LEAST_LEFT would be left.
     """
-    budget = int(KEPT * state.learned.count)
+    budget = int(LEFT_SURFELS * state.learned.count)
     if budget < LEAST_LEFT:
         raise full_card()
     state.learned.forget_gradients()
