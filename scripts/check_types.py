@@ -12,7 +12,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TYPED = ("batch", "formats", "geometry", "kernels", "model", "train")
-ELSEWHERE = 20  # errors in all other folders together
+ELSEWHERE = 16  # errors in all other folders together
 CEILINGS = {**dict.fromkeys(TYPED, 0), "elsewhere": ELSEWHERE}
 
 
@@ -21,9 +21,13 @@ def main() -> None:
     command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "--outputjson"]
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     try:
-        errors = [row for row in json.loads(done.stdout)["generalDiagnostics"] if row["severity"] == "error"]
+        said = json.loads(done.stdout)
+        errors = [row for row in said["generalDiagnostics"] if row["severity"] == "error"]
+        checked = said["summary"]["filesAnalyzed"]
     except (ValueError, KeyError):
         sys.exit(f"pyright did not run (exit status {done.returncode}):\n{done.stdout}")
+    if checked < (files := len(list((ROOT / "backend" / "refgs").rglob("*.py")))):
+        sys.exit(f"pyright checked only {checked} of {files} files")
     found: Counter[str] = Counter()
     for row in errors:
         file = Path(row["file"]).relative_to(ROOT / "backend" / "refgs")

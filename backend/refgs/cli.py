@@ -1,5 +1,6 @@
 """Parse the command line. Each command imports its own modules, so that help and wrong arguments are answered at once."""
 
+import io
 import os
 import signal
 import sys
@@ -282,7 +283,8 @@ def main() -> None:
     If the environment has REFGS_END_WITH_INPUT, the command also ends when its standard input closes. `refgs batch` starts commands so.
     """
     for stream in (sys.stdout, sys.stderr):  # a path may hold what the terminal's encoding lacks
-        stream.reconfigure(errors="backslashreplace")
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = _one_line(warnings.showwarning)
     signal.signal(signal.SIGTERM, _terminate)
     if "REFGS_END_WITH_INPUT" in os.environ:

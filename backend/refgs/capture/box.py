@@ -42,7 +42,7 @@ class Box:
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Mark the points (N, 3) that lie in the box, as bool (N,)."""
         inverse = np.linalg.inv(self.matrix)
-        return (np.abs(points @ inverse[:3, :3].T + inverse[:3, 3]) <= 1).all(axis=-1)
+        return np.all(np.abs(points @ inverse[:3, :3].T + inverse[:3, 3]) <= 1, axis=-1)
 
     def grid(self, side: int) -> np.ndarray:
         """Return a regular grid of points (side³, 3) over the box, corners included."""

@@ -85,7 +85,7 @@ class _Statistics:
         shown = loaded.bytes
         pixels = shown[inside] if inside.any() else np.zeros((1, 3), np.uint8)
         self.coverage = None if loaded.alpha is None else float(inside.mean())
-        self.clipped = float(loaded.clipped.any(axis=2)[inside].mean()) if inside.any() else 0.0
+        self.clipped = float(np.any(loaded.clipped, axis=2)[inside].mean()) if inside.any() else 0.0
         self.brightness, self.brightest = float(pixels.mean()), float(np.percentile(pixels, 99))
         self.grey = bool((pixels.max(axis=1) == pixels.min(axis=1)).all())
         self.sharpness = _sharpness(shown, inside)

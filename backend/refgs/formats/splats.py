@@ -269,7 +269,7 @@ def _shortest_last(rotations: np.ndarray, scales: np.ndarray) -> tuple[np.ndarra
         w * c - x * d + y * a + z * b,
         w * d + x * c - y * b + z * a,
     ]
-    return np.stack(turned, axis=1), np.take_along_axis(scales, (shortest[:, None] + [1, 2, 3]) % 3, axis=1)
+    return np.stack(turned, axis=1), np.take_along_axis(scales, (shortest[:, None] + np.arange(1, 4)) % 3, axis=1)
 
 
 def _other_elements(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[PlyElement, ...]:

@@ -95,7 +95,7 @@ def _untrimmed(mesh: trimesh.Trimesh) -> np.ndarray:
     kept = np.zeros(len(mesh.vertices), bool)
     inner = trimesh.Trimesh(mesh.vertices, mesh.faces[core], process=False)
     kept[inner.faces[_large(inner)]] = True
-    return _grown(kept, mesh.faces, FRAY - 1)[mesh.faces].any(axis=1)
+    return np.any(_grown(kept, mesh.faces, FRAY - 1)[mesh.faces], axis=1)
 
 
 def _border(mesh: trimesh.Trimesh) -> np.ndarray:

@@ -67,7 +67,7 @@ class Shape:
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Tell which points (..., 3) lie in a solid voxel."""
         at = np.floor((points - self.low) / self.voxel).astype(np.int32)
-        within = ((at >= 0) & (at < self.solid.shape)).all(axis=-1)
+        within = np.all((at >= 0) & (at < self.solid.shape), axis=-1)
         within[within] = self.solid[tuple(at[within].T)]
         return within
 

@@ -4,6 +4,7 @@ The code is simple and slow: the rasteriser evaluates every splat at every pixel
 """
 
 import math
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -198,6 +199,8 @@ def radiance_towards(
         light = free * light + (1 - free) * from_object
     share = metallic[:, None]
     if mirror:
+        if appearance is None:
+            raise ValueError("mirrors lie under a colour of their own")
         return light * share + (1 - share) * appearance
     at = torch.stack([dot, roughness], dim=-1)
     margins += [*(at - LEAST_N_V).abs().unbind(-1)]
@@ -237,7 +240,7 @@ def _displaced(features, alpha, own, pixels, camera: Camera, margins: list[Tenso
     (x0, y0), (x1, y1) = low.long().unbind(-1), (low + 1).minimum(last).long().unbind(-1)
     corners = stacked[y0, x0], stacked[y0, x1], stacked[y1, x0], stacked[y1, x1]
     weights = (1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y
-    sampled = sum(w[:, None] * c for w, c in zip(weights, corners, strict=True))
+    sampled = cast(Tensor, sum(w[:, None] * c for w, c in zip(weights, corners, strict=True)))
     there = sampled[:, -1]
     margins += [(there - SHIFT_ALPHA).abs()]
     trust = ((there - SHIFT_ALPHA) / SHIFT_ALPHA).clamp(0, 1).detach()[:, None]
