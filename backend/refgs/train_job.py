@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 class _Known(NamedTuple):
     """Hold what is known of a training before its capture is read.
 
-    `preset` is recorded in run.toml. `run` is the run that is resumed, or whose training is continued with `hints`, and `facts` are its
-    table [run].
+    `preset` is the preset's name, which is recorded in run.toml. `run` is the folder of an earlier run: the one to resume, or the one to
+    continue with `hints`. It is None for a new training. `facts` is the table [run] of that run's run.toml.
     """
 
     settings: Settings
@@ -263,7 +263,10 @@ def _removed_if_empty(out: Path) -> Iterator[None]:
 
 @contextmanager
 def _no_photos_left(out: Path) -> Iterator[None]:
-    """Remove the reduced photos from a folder if a `with` block raises: there is no run yet that could be resumed."""
+    """Delete the cached reduced photos in the folder `out` if the `with` block raises.
+
+    The run has not been created yet at this point. So no training can be resumed that would need these photos.
+    """
     try:
         yield
     except BaseException:

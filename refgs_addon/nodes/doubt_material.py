@@ -1,4 +1,7 @@
-"""Build the material that colours a run by its doubt: 0 where photos tell metal from paint, 1 where they do not."""
+"""Build the material that shows a run's doubt as colours.
+
+Doubt is 0 where the photos show whether the surface is metal or paint, and 1 where they do not.
+"""
 
 import bpy
 

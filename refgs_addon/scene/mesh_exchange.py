@@ -30,10 +30,10 @@ PACKED = {
 
 
 def write_mesh(mesh: Path, path: Path, engine: str = "Any Program") -> None:
-    """Write a run's mesh.glb as a .usdc or .fbx, and its textures into the folder `NAME textures` beside that file.
+    """Convert a run's mesh.glb to the .usdc or .fbx file `path`. Copy the run's textures to the folder `NAME textures` beside that file.
 
-    `engine` is a key of PACKED, whose textures are written as well. The open .blend does not change. Raises InputError where a texture is
-    missing or a file cannot be read or written.
+    `engine` is a key of PACKED and selects extra textures for a game engine, which are written to the same folder. The open .blend does
+    not change. Raises InputError if a texture is missing, or if a file cannot be read or written.
     """
     sources = {name: mesh.parent / TEXTURES / f"{name}.png" for name in (*_PICTURES, "occlusion")}
     for source in sources.values():

@@ -18,7 +18,11 @@ LIBRARY = "library"  # the folder in RUNS in which Blender makes the runs assets
 
 
 class Ask(BaseModel):
-    """Hold the options of `refgs train` for a capture. Where a value is None, the capture takes that of the level above it in the list."""
+    """Hold the options of `refgs train` for one level of a batch list, such as a line for a capture.
+
+    If `preset` or `minutes` is None, the level above gives the value (see `under`). The `set` options of both levels are joined, and
+    those of the level above come first.
+    """
 
     model_config = ConfigDict(extra="forbid", strict=True)
     preset: str | None = None

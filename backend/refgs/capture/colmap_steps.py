@@ -34,10 +34,13 @@ INSIDE_FEATURES = (
 
 
 def choose_pairs(database: Path) -> list[tuple[int, int]]:
-    """Choose which photos in COLMAP's database to match. Return pairs of their indices; photos are sorted by name.
+    """Choose which photos in COLMAP's database to match. Returns pairs of photo indices. Photos are sorted by name.
 
-    With up to ALL_PAIRS photos, this is every pair. With more, each photo is matched with the next NEXT ones, which are close by in a film
-    or a walk around the object, and with some that look like it. These link several rounds, and photos whose names say nothing.
+    With up to ALL_PAIRS photos, every pair is matched. With more, each photo is matched with two groups:
+
+    - The next NEXT photos. In a video, or a walk around the object, they were taken nearby.
+    - Some photos that look similar. They link several walks around the object. They also help if the file names do not follow the
+      camera's path.
     """
     import pycolmap
 

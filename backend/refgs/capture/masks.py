@@ -162,8 +162,8 @@ def with_masks(
 def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, float]:
     """Guess a box around the object: a cube around the point at which the cameras look.
 
-    Return the box, the part of it that the object is likely to fill, and the radius of the region of interest. `views` are the capture's,
-    without masks that should not count. Raises InputError if the cameras look outwards, as in a room.
+    `views` are the capture's views. The caller has removed the masks that it wants to ignore. Returns the box, the fraction of it that
+    the object is likely to fill, and the radius of the region of interest. Raises InputError if the cameras look outwards, as in a room.
     """
     found = find_region(views, up_direction(views), capture.points, [])
     if found.because == LOOK_OUT:

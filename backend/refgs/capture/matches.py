@@ -20,9 +20,10 @@ LEAST_PAIRS = 8
 
 
 class Matches(NamedTuple):
-    """Hold the pixels (M, 2) of points that the photos of two views, given by their indices, have in common.
+    """Hold the matched pixels of two photos.
 
-    They are pixels of photos reduced to SIDE.
+    `first` and `second` are the indices of the two views. `ours` and `theirs` (M, 2) are the pixels of the same M points in the first and
+    in the second photo. Pixels count in photos reduced to SIDE.
     """
 
     first: int

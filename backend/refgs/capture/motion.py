@@ -223,7 +223,10 @@ def end_with_parent() -> None:
 
 
 def _child(photos: list[Path], masks: list[Path], database: Path, model: Path, events: Connection) -> None:
-    """Run `_run_colmap`, and send an InputError to the pipe `events`. End with the parent, even if that is killed."""
+    """Run `_run_colmap` in a child process. If it raises an InputError, send the error through the pipe `events`.
+
+    The child ends when its parent process ends, even if the parent was killed.
+    """
     end_with_parent()
     try:
         _run_colmap(photos, masks, database, model, events)

@@ -29,9 +29,10 @@ GREY = 0.02  # difference of a grey picture's channels at the most, of 1; JPEG d
 
 
 class Prior(NamedTuple):
-    """Hold a prior of one photo, undistorted and reduced: values (H, W) or (H, W, 3), and where they are known (H, W).
+    """Hold one photo's prior, undistorted and reduced in size: normals or depth that another program estimated.
 
-    Values are float32, and 0 where they are not known. `camera` is the photo's camera for this size.
+    `values` are float32, (H, W, 3) for normals or (H, W) for depth, and 0 where unknown. `known` (H, W) marks the known pixels. `camera`
+    is the photo's camera for this size.
     """
 
     values: np.ndarray

@@ -27,8 +27,9 @@ def albedo_ratio(pairs: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
 def albedo_square(rendered: np.ndarray, true: np.ndarray, alpha: np.ndarray) -> float:
     """Compute TensoIR's mean squared error of one view's linear base colours (h, w, 3), over all pixels of the picture.
 
-    The rendered base colour is corrected by `albedo_ratio` and clipped to 0..1. Then both are put over white and encoded by a power.
-    `alpha` is the object's true one. Pixels where it is 0 have no error.
+    The caller has already corrected `rendered` by `albedo_ratio`. The function clips it to 0..1, and sets it to white where `alpha` is 0.
+    It blends `true` with white by `alpha`, which is the object's true alpha. It then encodes both with the gamma GAMMA. Pixels where
+    `alpha` is 0 have no error.
     """
     ours = np.where((alpha > 0)[..., None], np.clip(rendered, 0, 1), 1)
     theirs = true * alpha[..., None] + 1 - alpha[..., None]

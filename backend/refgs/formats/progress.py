@@ -1,4 +1,8 @@
-"""Describe two files: progress.json in the run folder of a running training, and the record of a batch's step that has ended."""
+"""Describe two file formats.
+
+- progress.json: how far a training has come. It is in the run folder while the training runs.
+- the record of a finished batch step: how the step ended.
+"""
 
 from refgs.formats.checkpoint import Count, Seconds
 from refgs.formats.validate import Model

@@ -48,7 +48,10 @@ class RunFile(Model):
 
 
 class Summary(Model):
-    """Hold the values of a run.toml by which the report page tells runs apart. Any release may have written them."""
+    """Hold the tables [run] and [settings] of a run.toml. The report page labels runs by the values in which they differ.
+
+    The file may come from any release, so no key is required.
+    """
 
     run: dict[str, Value] = Field(default_factory=dict)
     settings: dict[str, dict[str, Value | list[Value]]] = Field(default_factory=dict)

@@ -96,7 +96,10 @@ class Learned(Mapping[str, Tensor]):
             self._by_row.add(name)
 
     def drop(self, *names: str) -> None:
-        """Stop learning tensors, if they are learned. Those by row become constant: all surfels have the values of the first one."""
+        """Stop learning the tensors `names`. Names that are not learned are ignored.
+
+        A tensor by row becomes constant: all surfels get the first surfel's value. Any other tensor is removed.
+        """
         for name in {*names} & {*self._values}:
             value = self._values.pop(name)
             self.moments.pop(name, None)
@@ -220,7 +223,7 @@ class Learned(Mapping[str, Tensor]):
             self.constant[name] = tensors[f"constant.{name}"] if learned is None else learned[:1]
 
     def _kept(self, name: str) -> str:
-        """Return the name of a tensor in a checkpoint."""
+        """Return the name that the tensor `name` has in a checkpoint: "parameter.NAME" for a tensor by row, otherwise its own name."""
         return f"parameter.{name}" if name in self._by_row else name
 
 

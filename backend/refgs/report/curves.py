@@ -124,9 +124,10 @@ def time_to(curve: Curve, error: float) -> float | None:
 
 
 def levels(curves: list[Curve]) -> list[float]:
-    """Choose about LEVELS round numbers between the worst and the best error of the curves, largest error first.
+    """Choose about LEVELS error values between the worst and the best error of the curves. Return them with the largest error first.
 
-    The report says when each curve reaches them. If the errors come from a PSNR, they are round numbers of decibels.
+    The values are round numbers. If the errors come from a PSNR, the values are round in decibels instead. The report says when each
+    curve reaches each value.
     """
     quantity = curves[0].quantity
     worst, best = max(c.errors[0] for c in curves), min(c.errors.min() for c in curves)

@@ -16,11 +16,12 @@ Crop = tuple[slice, slice]
 
 
 class Photo(NamedTuple):
-    """Hold a view's photo on the training's device: `image` (H, W, 3), sRGB codes, and `mask` (H, W) uint8 or None.
+    """Hold a view's photo on the training's device.
 
-    `image` has the dtype uint8 or uint16, and `white` is the code of 1. The dtype's largest code means that or brighter.
-
-    The photo may be a crop of a photo of the size `whole` (H, W). Beyond the crop, the whole photo is background.
+    - `image` (H, W, 3): integer codes of sRGB values, uint8 or uint16. The code `white` stands for the value 1. The dtype's largest code
+      stands for its own value and for all brighter ones.
+    - `mask` (H, W): uint8, or None.
+    - `whole` (H, W): the size of the whole photo if this is a crop. Beyond the crop, the whole photo is background.
     """
 
     image: Tensor

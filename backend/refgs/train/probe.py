@@ -211,7 +211,10 @@ def specular_explains(state: State) -> Lost:
 
 
 def mirroring_itself(inputs: RenderInputs, radiance: Tensor) -> RenderInputs:
-    """Return inputs in which the object mirrors the linear `radiance` (3,) of itself: wherever it hides the light from a mirror ray."""
+    """Return a copy of `inputs` in which all inter-reflected light is the constant linear `radiance` (3,).
+
+    A mirror ray that hits the object then returns this radiance instead of the environment's light.
+    """
     surfels = inputs.surfels
     constant = surfels._replace(
         indirect_dc=(radiance / DC).expand_as(surfels.indirect_dc),

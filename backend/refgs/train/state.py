@@ -79,7 +79,7 @@ class State:
         self.parts: dict[type, Any] = {}
 
     def part(self, kind: type[P]) -> P:
-        """Return the part of the training of this kind, with its memory (see `train/part.py`)."""
+        """Return the training's `Part` object of the class `kind`. It remembers what this part has found (see `train/part.py`)."""
         return self.parts[kind]
 
     def needed(self, name: str) -> bool:

@@ -205,7 +205,10 @@ def even_by_logarithm(iteration: int) -> bool:
 
 
 def _late(state: State, part: float) -> float:
-    """Return the progress when this part of the time in which the residual learns is over."""
+    """Return the progress (0..1) at which the fraction `part` of the residual's learning time is over.
+
+    The residual learns from `state.residual_start` to the end of the training.
+    """
     return state.residual_start + part * (1 - state.residual_start)
 
 

@@ -207,9 +207,10 @@ class Trainer:
             trim()  # what decisions took
 
     def _check(self, whole: bool) -> None:
-        """Check that the training's numbers are finite. If the guard says so, go back to the last checkpoint.
+        """Check that the training's numbers are finite. If `Guard.look` returns a reason, go back to the last checkpoint, and warn.
 
-        `whole` is passed on to `Guard.look`. The lost time still counts as training time.
+        The time spent since that checkpoint still counts as training time. `whole` is passed on to `Guard.look`: if true, surfels are
+        checked even if no step was skipped.
         """
         state = self.state
         if why := self.guard.look(state, whole, lambda: checkpoint.complete(state.folder / CHECKPOINTS)):

@@ -73,9 +73,9 @@ class Need:
         raise NotImplementedError
 
     def apply(self, state: State, found: Found) -> None:
-        """Leave out this optional part of the training, after it was found not to be needed.
+        """Leave this optional part of the training out. The decision was that the scene does not need it.
 
-        It is called once after the decision, and again when a run is resumed. `found` is the recorded decision.
+        The training calls this method once after the decision, and again when a run is resumed. `found` is the recorded decision.
         """
 
     def undo(self, state: State, why: str) -> None:

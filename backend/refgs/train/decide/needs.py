@@ -85,7 +85,11 @@ def _bring_back_specular(state: State, decision: Decision) -> None:
 
 
 def _undo_following(state: State, decisions: dict[str, Found], why: str) -> None:
-    """Take back the `decisions` that were made because the scene was found matte. Those that a setting asked for stay."""
+    """Undo the decisions that followed from the decision to leave out specular shading.
+
+    Such a decision is deleted from `decisions`, and its part of the training is brought back. A decision stays if the user set it to "on"
+    or "off". `why` is the reason, for the record.
+    """
     for need in NEEDS:
         if need.follows == SPECULAR.name and need.name in decisions and need.asked(state) == "auto":
             del decisions[need.name]

@@ -89,7 +89,10 @@ def _mean_radiance(state: State, inputs: RenderInputs, views: list[int]) -> Tens
 
 
 def _light(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render under the light, and under the coarser one that was chosen in its place."""
+    """Render each view twice: with the full-resolution light, and with the lower-resolution light that replaces it.
+
+    Yields nothing if the scene needs the full-resolution light, or if there is no specular shading.
+    """
     inputs = state.inputs()
     if found.needed or inputs.settings.reflection == "none":
         return

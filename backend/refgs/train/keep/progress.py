@@ -12,7 +12,11 @@ from refgs.train.state import State
 
 
 class Means(Part):
-    """Hold running means of what `Trainer.step` returns: the `loss`, and the mean squared error, `square`. Empty before the first step."""
+    """Hold running means of the values that `Trainer.step` returns. `values` is empty before the first step.
+
+    - `loss`: the training loss.
+    - `square`: the mean squared error.
+    """
 
     name = "means"
 

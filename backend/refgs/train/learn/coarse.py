@@ -60,7 +60,11 @@ def begin(state: State, pixels: float, refined: bool) -> None:
 
 
 def refine(state: State, step: Step) -> None:
-    """Take larger photos once their stage has come. They are never reduced again, even if the training gets longer."""
+    """Switch to larger photos when the training's progress reaches the stage that uses them.
+
+    The training never switches back to smaller photos. Progress can fall if the training gets more iterations, but the photos then keep
+    their size.
+    """
     coarse = state.part(Coarse)
     factor = stage_at(step.progress, coarse.stages).factor
     if factor < coarse.factor:

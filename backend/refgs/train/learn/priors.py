@@ -39,10 +39,11 @@ Maps = dict[int, tuple[Tensor, Camera]]
 
 
 class Priors(Part):
-    """Hold what other programs guessed from the training views' photos.
+    """Hold the normal and depth priors of the training views, which other programs estimated from the photos.
 
-    `normals` are int8 (H, W, 3) in the camera's axes, and `depth` float32 (H, W) of any scale and shift, which is a `disparity` for all
-    views or for none. Both are 0 where nothing is known.
+    Both fields map a view's number to a map and the photo's camera for the map's size. `normals` are int8 (H, W, 3) in the camera's axes.
+    `depth` is float32 (H, W) with unknown scale and shift. If `disparity` is true, all depth maps are disparities; otherwise none is. A
+    value of 0 means unknown.
     """
 
     name = "priors"
@@ -266,6 +267,10 @@ def _counts(rendering: Rendering, photo: Photo) -> Tensor:
 
 
 def _saturating(error: Tensor, half: float, counts: Tensor, photo: Photo) -> Tensor:
-    """Average error / (error + half) over the whole photo, weighted by `counts`."""
+    """Compute a saturating loss: the sum of error / (error + half), weighted by `counts`, divided by the number of pixels of the whole
+    photo.
+
+    An error equal to `half` gives a loss of 1/2. Much larger errors give nearly 1, so that wrong priors have a limited effect.
+    """
     rows, columns = photo.whole or photo.image.shape[:2]
     return (counts * error / (error + half)).sum() / (rows * columns)

@@ -1,8 +1,10 @@
-"""Tell mirroring surfaces from matte ones whose light changes from photo to photo.
+"""Tell mirroring surfaces from matte surfaces whose light changes from photo to photo.
 
-Clouds, a lamp that is carried along, or the photographer's shadow change the radiance of a matte surface along its own colour, as a
-coloured metal changes with the view. In each photo, such a change is nearly linear in the surface's normal (Ramamoorthi and Hanrahan 2001),
-whatever it is in other photos. What is mirrored is one function of the mirrored direction, the same in all photos.
+The light can change because of clouds, a lamp that is carried along, or the photographer's shadow. A matte surface then changes along its
+own colour, and looks like a coloured metal, which changes with the view.
+
+Two models tell them apart. A change of the light is nearly linear in the surface normal in each photo (Ramamoorthi and Hanrahan 2001). It
+can be another linear function in each photo. A mirrored picture is one function of the mirror direction, which is the same in all photos.
 """
 
 import math

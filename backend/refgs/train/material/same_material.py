@@ -97,10 +97,13 @@ def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix
 
 
 def _solve(graph: sparse.csr_matrix, weight: np.ndarray, weighted: np.ndarray) -> np.ndarray:
-    """Return the values x (N,) that minimise Σ w_i (x_i − v_i)² + reach Σ g_ij (x_i − x_j)², where `weighted` is w v.
+    """Solve for the values x (N,) that minimise Σ w_i (x_i − v_i)² + reach Σ g_ij (x_i − x_j)².
 
-    The second sum approximates the integral of the squared gradient over the surface, which does not depend on N, but the first grows with
-    N. So the reach grows with N.
+    `weight` is w. `weighted` is the product w v. `graph` is the Laplacian matrix of the edge weights g. The first sum keeps each x_i near
+    its given value v_i. The second sum makes neighbours alike.
+
+    The first sum grows with N. The second sum does not: it approximates the integral of the squared gradient over the surface. So `reach`
+    is proportional to N, but at least LEAST_REACH. It keeps the distance over which evidence spreads independent of N.
     """
     reach = max(REACH * len(weight), LEAST_REACH)
     return cg(reach * graph + sparse.diags(weight), weighted, rtol=CG_TOLERANCE, maxiter=CG_STEPS)[0]
