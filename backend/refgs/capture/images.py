@@ -175,9 +175,10 @@ def _exr_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def write_for_colmap(path: Path, out: Path) -> bool:
-    """Write a photo's pixels to the JPEG `out` if COLMAP cannot read them: HEIC, WebP, RAW, EXR, and TIFF that has to be turned upright.
+    """Write a photo's pixels to the JPEG `out` if COLMAP cannot read them: HEIC, WebP, RAW, EXR, or TIFF that is not stored upright.
 
-    Return whether it was written. The pixels are turned as `Header` says that they are stored. Raises InputError naming the file.
+    Return whether the JPEG was written. It has the orientation in which `Header` says that the pixels are stored. Raises InputError naming
+    the file.
     """
     if _is_raw(path) or _is_exr(path):
         stored = np.rot90(read_image(path)[0], read_header(path).turns)

@@ -20,9 +20,9 @@ LEAST_PAIRS = 8
 
 
 class Matches(NamedTuple):
-    """Hold the pixels (M, 2) of points that the photos of two views, given by their indices, have in common.
+    """Hold points that the photos of two views have in common. `first` and `second` are the views' indices.
 
-    They are pixels of photos reduced to SIDE.
+    `ours` and `theirs` (M, 2) are the points' pixels in both photos, reduced to SIDE.
     """
 
     first: int

@@ -9,7 +9,8 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.capture import LoadedView
 
-MARGIN = 10  # pixels about the mask: no D-SSIM window, whose radius is 5, then sees both the object and the border
+# Pixels around the mask; no D-SSIM window, whose radius is 5, then covers both the object and the crop's border.
+MARGIN = 10
 
 Crop = tuple[slice, slice]
 """Rows and columns of a photo."""
@@ -18,9 +19,9 @@ Crop = tuple[slice, slice]
 class Photo(NamedTuple):
     """Hold a view's photo on the training's device: `image` (H, W, 3), sRGB codes, and `mask` (H, W) uint8 or None.
 
-    `image` has the dtype uint8 or uint16, and `white` is the code of 1. The dtype's largest code means that or brighter.
+    `image` has the dtype uint8 or uint16. The code `white` means the value 1. The dtype's largest code means its own value or brighter.
 
-    The photo may be a crop of a photo of the size `whole` (H, W). Beyond the crop, the whole photo is background.
+    The photo may be a crop. The full photo then has the size `whole` (H, W), and is background outside the crop.
     """
 
     image: Tensor
