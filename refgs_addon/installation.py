@@ -3,7 +3,7 @@
 Blender also runs this file as a separate process. That process reads one command, `install` or `remove`, from stdin, and prints events to
 stdout (docs/job-protocol.md). When Blender ends, stdin closes: the process then kills the program that it has started, and exits.
 
-What is installed is what was released: the zip has locks, which hold the version and the SHA-256 of every package.
+The packages are those of the release: the add-on's zip has locks with the version and the SHA-256 of every package.
 
 An interrupted installation does no harm. The last step writes a marker file, and without that file the trainer counts as not installed.
 Finished downloads stay in uv's cache for the next installation.
@@ -77,8 +77,8 @@ def python(home: Path) -> Path:
 def needed_bytes() -> float:
     """Estimate the disk space in bytes for the trainer.
 
-    A machine with nvidia-smi needs more, because it may get torch's CUDA build. So does Linux if only that was locked at release: the
-    package index has no other.
+    A machine with nvidia-smi needs more, because it may get torch's CUDA build. Linux also needs more if only the CUDA build was locked at
+    release, because the package index has no other.
     """
     locked = sys.platform == "linux" and (WHEELS / "lock.txt").is_file() and not (WHEELS / "lock-cpu.txt").is_file()
     return NEEDED_WITH_CARD if locked or shutil.which("nvidia-smi") else NEEDED
@@ -216,9 +216,10 @@ def _install(home: Path, uv: Path, trainer: Path) -> None:
 
 
 def _choose_lock(program: Path, variables: dict[str, str], home: Path, locks: Path) -> Path:
-    """Return the lock for the build of torch that uv takes for this machine. Without one, let `variables` say to take the package index's.
+    """Return the lock for the build of torch that uv chooses for this machine.
 
-    A build's name is in torch's version, such as 2.14.0+cpu. The package index has versions without.
+    If there is no such lock, change `variables` so that uv takes the package index's build. The name of a build is in torch's version, such
+    as 2.14.0+cpu. Versions in the package index have no such name.
     """
     lock, wanted = locks / "lock.txt", home / "torch.txt"
     if "UV_TORCH_BACKEND" not in variables or not (pinned := re.search(r"^torch==\S+", lock.read_text(), re.M)):
@@ -248,7 +249,7 @@ def _resolve(program: Path, variables: dict[str, str], home: Path, requirements:
 
 
 def _describe_origin(packages: dict[str, tuple[str, str]]) -> str:
-    """Say where packages came from. `packages` is what `_resolve` returns."""
+    """Describe where packages came from. `packages` is what `_resolve` returns."""
     hosts: dict[str, list[str]] = {}
     for name, (version, index) in packages.items():
         hosts.setdefault(urlsplit(index).hostname or index, []).append(f"{name} {version}")

@@ -335,7 +335,7 @@ def _run_installation(command: str, home: Path, log: Path, arguments: dict[str, 
 
 @dataclass(frozen=True)
 class Asked:
-    """Hold what a training is asked for.
+    """Hold the options of a training.
 
     - `capture` is a folder with photos, `out` the run folder.
     - `preset` is the name of a set of settings. If it is None, the settings are chosen so that the training takes `minutes`. If both are
@@ -386,7 +386,7 @@ def train(python: Path, asked: Asked, log: Path, mesh: bool = True) -> Job:
 def train_many(python: Path, captures: Path, out: Path, log: Path, preset: str) -> Job:
     """Start a job that trains on all captures in the folder `captures`, by `refgs batch`. The runs are made in the folder `out`.
 
-    The job first waits until earlier trainings have ended. What an earlier batch did there is not done again. Raises InputError if
+    The job first waits until earlier trainings have ended. Steps that an earlier batch did there are not done again. Raises InputError if
     `captures` is missing, or a batch works in `out` already.
     """
     if not captures.exists():

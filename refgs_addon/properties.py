@@ -31,7 +31,7 @@ PRESETS = [
 
 
 class Many(bpy.types.PropertyGroup):
-    """Store what the panel Train Many is set to."""
+    """Store the settings of the panel Train Many."""
 
     captures: StringProperty(
         name="Captures",

@@ -1,4 +1,4 @@
-"""Say what a training was asked for. The command line, the job protocol and batches make this record; training takes it whole."""
+"""Record what a training was asked for. The command line, the job protocol and batches make this record, and training reads it."""
 
 import math
 from dataclasses import dataclass, replace
@@ -68,7 +68,7 @@ class Asked:
         return preset_settings(preset or self.preset or "standard", self._assignments)
 
     def resumed(self) -> "Asked":
-        """Ask to resume this training. Its run folder knows its settings and its hints."""
+        """Return the record that resumes this training. Its run folder holds its settings and its hints."""
         return replace(self, changes=(), resume=True, run=None, hints=None)
 
     def words(self) -> list[str]:

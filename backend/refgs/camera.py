@@ -8,7 +8,7 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Pinhole camera without distortion, in OpenCV's convention: x right, y down, z forward.
+    """Hold a pinhole camera without distortion, in OpenCV's convention: x right, y down, z forward.
 
     A world point p is seen at pixel (fx·x/z + cx, fy·y/z + cy), where (x, y, z, 1) = world_to_camera @ (p, 1). `world_to_camera` is a rigid
     4×4 float64 matrix. Focal lengths and principal point are in pixels, and pixel centres are at half-integers.

@@ -122,8 +122,8 @@ def create_run(
 ) -> None:
     """Create a run folder with cameras.json, capture.json, and run.toml, which comes last. Raise InputError if the folder is not free.
 
-    `settings` are the values in use. `chosen` and `changed` are written to run.toml for the user: for each setting that was "auto", the
-    value that was chosen and why; and the rows of changed settings (see `record_changes`).
+    `settings` are the values in use. Two tables are written to run.toml for the user. `chosen` has the chosen value and the reason of each
+    setting that was "auto". `changed` has the rows of changed settings (see `record_changes`).
     """
     check_free(folder)
     try:

@@ -1,9 +1,9 @@
 """Correct the diffuse light of the world in Eevee, by a node group that the materials of runs share.
 
-Of the world's light, Eevee keeps only the first two bands of spherical harmonics for diffuse surfaces, and weakens the second where their
-sum could be negative. So the bright side of an object is up to a third too dark, its dark side too bright. The group multiplies the base
-colour by the true irradiance over Eevee's. Three bands give the true irradiance to a percent (Ramamoorthi and Hanrahan 2001, "An Efficient
-Representation for Irradiance Environment Maps").
+For diffuse surfaces, Eevee keeps only the first two bands of spherical harmonics of the world's light. It weakens the second band where
+their sum could be negative. So the bright side of an object is up to a third too dark, and its dark side is too bright. The group
+multiplies the base colour by the true irradiance divided by Eevee's. Three bands give the true irradiance to a percent (Ramamoorthi and
+Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps").
 """
 
 from collections.abc import Sequence

@@ -24,10 +24,10 @@ _shown: tuple[Path, object] | None = None
 
 
 class Row(NamedTuple):
-    """Hold what a batch says of one run. `state` is "waiting", "running", "done", "failed" or "stopped".
+    """Hold a batch's row on one run. `state` is "waiting", "running", "done", "failed" or "stopped".
 
-    `words` says how far the run is or what it reached, `what` which step failed and why. `log` and `picture` are paths, "" if there is
-    none.
+    `words` says how far the run is, or which figures it reached. `what` says which step failed and why. `log` and `picture` are paths, ""
+    if there is none.
     """
 
     name: str
@@ -41,7 +41,7 @@ class Row(NamedTuple):
 def read_rows(folder: Path) -> list[Row]:
     """Read the rows of the batch whose runs are in a folder. There are none if there was no batch. Damaged rows are left out.
 
-    Of a batch that no process works on any more, runs that have not ended are "stopped".
+    If no process works on the batch any more, runs that have not ended are "stopped".
     """
     try:
         found = read_json(folder / jobs.LOGS / ROWS)["rows"]
@@ -109,6 +109,6 @@ def chosen_row(folder: Path) -> bpy.types.PropertyGroup | None:
 
 
 def forget_table() -> None:
-    """Forget which table the panel has, as its list is removed."""
+    """Forget which table the panel shows, because its list is removed."""
     global _shown
     _shown = None

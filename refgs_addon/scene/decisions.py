@@ -1,4 +1,4 @@
-"""Read what a training decided about a scene, with pictures of both answers, and train again the other way."""
+"""Read the decisions of a training about a scene, with pictures of both answers, and train again with the other answer."""
 
 from dataclasses import dataclass
 from pathlib import Path

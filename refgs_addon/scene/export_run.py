@@ -97,9 +97,8 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
 def export_run(collection: bpy.types.Collection, folder: Path) -> None:
     """Write a run with its edits as a new run folder, which must not exist. The run itself does not change.
 
-    If the run was edited, its mesh is not copied, because neither shape nor textures contain that. `refgs export` or the trainer makes a
-    new mesh.
-    Raises InputError where the run's files are missing or have changed, or the folder exists or cannot be written.
+    If the run was edited, its mesh is not copied, because its shape and textures do not contain the edits. `refgs export` or the trainer
+    makes a new mesh.
     """
     original = run_folder(collection)
     if folder.exists():
@@ -137,7 +136,7 @@ def export_light(collection: bpy.types.Collection, path: Path) -> None:
 def export_mesh(collection: bpy.types.Collection, path: Path, engine: str = "Any Program") -> None:
     """Write a run's mesh with its textures. A .glb is a copy of the run's file; `mesh_exchange` writes .usdc and .fbx for `engine`.
 
-    Raises InputError if the run has no mesh. Raises InputError too if the run was edited, because the mesh does not contain that.
+    Raises InputError if the run has no mesh, or if it was edited, because the mesh does not contain the edits.
     """
     mesh = run_folder(collection) / "mesh.glb"
     if is_edited(splats_of(collection)):

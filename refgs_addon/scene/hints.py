@@ -51,8 +51,8 @@ def chosen_part(splats: bpy.types.Object, active: bpy.types.Object | None) -> np
 def part_at(splats: bpy.types.Object, origin: Vector, direction: Vector) -> np.ndarray:
     """Return the positions (P, 3) of the splats of the part that a ray hits first, in the splats' coordinates.
 
-    The ray is in world space. A part ends at creases: materials do not tell, for they are what may be wrong. Raises InputError if the ray
-    hits no splat.
+    The ray is in world space. A part ends at creases. Materials do not limit it, because they may be what is wrong. Raises InputError if
+    the ray hits no splat.
     """
     inverse = _to_world(splats).inverted_safe()
     seed = _hit(splats, np.array(inverse @ origin), np.array(inverse.to_3x3() @ direction))
@@ -71,7 +71,7 @@ def write_hint(file: Path, kind: str, points: np.ndarray) -> None:
 
 
 def _hit(splats: bpy.types.Object, origin: np.ndarray, direction: np.ndarray) -> int | None:
-    """Find the splat at which half of the light along a ray is blocked, or the last one if less is. None if no splat is hit."""
+    """Find the splat at which half of the light along a ray is blocked. If less is blocked, return the last one; None if none is hit."""
     position, scale = (_attribute(splats, name, "vector", 3) for name in ("position", "scale"))
     axes = splat_axes(_attribute(splats, "rotation", "value", 4))
     normal = np.cross(*axes)

@@ -110,9 +110,9 @@ def add_root(name: str, splats: bpy.types.Object, mesh: list[bpy.types.Object]) 
 
 
 def put_under(meshes: list[bpy.types.Object], splats: bpy.types.Object) -> None:
-    """Make the meshes what casts the shadows of the splats, and what reflections see of them, where `run_parts.show` shows the splats.
+    """Let the meshes cast the shadows of the splats, and stand for them in reflections, where `run_parts.show` shows the splats.
 
-    A mesh is drawn in by then, as the splats would lie in its shadow where they are within it.
+    Each mesh is shrunk a little, because splats inside it would lie in its shadow.
     """
     depth = DEPTH * splats.parent[run_parts.ROOT]
     for item in meshes:

@@ -20,7 +20,7 @@ def results_folder(scene: bpy.types.Scene) -> Path | None:
 
 
 def train_many(scene: bpy.types.Scene) -> jobs.Job:
-    """Start a job that trains on all captures of the scene's folder, or resumes that. `batch_table` has its progress.
+    """Start a job that trains on all captures of the scene's folder, or resumes such a job. `batch_table` shows its progress.
 
     Raises InputError if there is no trainer or no such folder, or if a batch works there already.
     """

@@ -1,4 +1,4 @@
-"""Find how large an imported run is, and put it beside what stands in its place."""
+"""Find how large an imported run is, and move it beside objects that stand in the same place."""
 
 import bpy
 from mathutils import Vector

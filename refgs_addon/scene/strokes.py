@@ -1,7 +1,7 @@
-"""Paint strokes on photos: white on the object, black on what is not. The trainer corrects the masks by them.
+"""Paint strokes on photos: white on the object, black on everything else. The trainer corrects the masks by them.
 
-A canvas is an image in Blender with the photo in the middle of the brightness range, so that white and black are strokes and nothing else.
-What the mask leaves out is red. The strokes alone are written to CAPTURE/strokes (docs/photos.md), transparent where nothing was painted.
+A canvas is an image in Blender. It shows the photo in the middle of the brightness range, so that only strokes are white or black. Pixels
+outside the mask are red. The strokes alone are written to CAPTURE/strokes (docs/photos.md), transparent where nothing was painted.
 """
 
 import re
@@ -64,7 +64,7 @@ def add_canvas(capture: Path, camera: bpy.types.Object) -> bpy.types.Image:
 
 
 def show_masks(capture: Path) -> None:
-    """Show the present masks on the canvases of a capture. Strokes stay, those that are not saved too."""
+    """Show the present masks on the canvases of a capture. All strokes stay, even unsaved ones."""
     for canvas in canvases():
         if canvas[CAPTURE] == str(masks_root(capture)):
             _draw(canvas, _read_photo(Path(canvas[PHOTO]), *canvas.size), _strokes(canvas))
@@ -90,13 +90,13 @@ def save(capture: Path) -> list[Path]:
 
 
 def masks_root(capture: Path) -> Path:
-    """Return the folder in which a capture's folders masks and strokes lie: the capture's, unless that is one of reduced photos."""
+    """Return the folder that holds a capture's folders masks and strokes. It is the capture's, or that above a folder of reduced photos."""
     reduced = re.fullmatch(r"images_\d+", capture.name) and (capture.parent / "sparse").is_dir()
     return capture.parent if reduced else capture
 
 
 def _name_in(capture: Path, photo: Path) -> Path:
-    """Return the path of a photo's strokes in the folder of strokes: that of the photo in the folder of photos."""
+    """Return a photo's path relative to the folder of photos. Its strokes have the same relative path in the folder of strokes."""
     try:
         inner = photo.resolve().relative_to(capture.resolve())
     except ValueError:

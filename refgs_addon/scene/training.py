@@ -91,9 +91,10 @@ def make_masks(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def _show_masks(number: int, capture: Path, found: dict) -> None:
-    """Show masks that were just made: on canvases of strokes, and as the box around the object, or the artist's box where it is now.
+    """Show masks that were just made: on canvases of strokes, and as the box around the object.
 
-    `found` is the trainer's result of making them. `number` is the scene's `session_uid`.
+    If the artist placed the box, move it with the capture's frame instead. `found` is the trainer's result of making masks. `number` is the
+    scene's `session_uid`.
     """
     strokes.show_masks(capture)
     if known := _scene(number):
@@ -115,7 +116,7 @@ def save_strokes(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def train_other_way(scene: bpy.types.Scene, folder: Path, need: str) -> jobs.Job:
-    """Start a job that trains as `train` does, but decides a need as the run in `folder` did not.
+    """Start a job that trains as `train` does, but with the opposite of the decision about a need that the run in `folder` made.
 
     The result goes into a new folder beside that run. Where the scene has a property for the need, it gets the other answer. Raises
     InputError as `train` does, and if the run's capture is not the scene's.
@@ -276,7 +277,7 @@ def _remember(scene: bpy.types.Scene, run: Path, capture: Path | None = None) ->
 
 
 def _trained_capture(scene: bpy.types.Scene, run: Path) -> Path | None:
-    """Return the capture that a run was trained on, as the scene's list says, or the run itself. None if neither does."""
+    """Return the capture that a run was trained on, from the scene's list or from the run itself. Return None if neither names it."""
     known = next((known.capture for known in scene.refgs.runs if Path(known.folder) == run), "")
     return Path(known) if known else capture_of(run)
 

@@ -81,7 +81,7 @@ def match_light(scene: bpy.types.Scene) -> None:
 
 
 def correct_diffuse(scene: bpy.types.Scene) -> None:
-    """Make the materials of imported runs show the diffuse light of the scene's world right in Eevee, after the world has changed.
+    """Correct the diffuse light of imported runs in Eevee after the scene's world has changed.
 
     A world that RefGS did not make is shown as Eevee shows it.
     """

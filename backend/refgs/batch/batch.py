@@ -74,7 +74,7 @@ class Batch:
         self._jobs = read_jobs(source, out, ask)
 
     def run(self, engine: Engine, stop: Callable[[int, int, float], bool]) -> int:
-        """Run all steps. Returns the exit status: 0 if all is done, otherwise what the worst of the failures calls for.
+        """Run all steps. Returns the exit status: 0 if all is done, otherwise the one that the worst failure calls for.
 
         `stop(done, total, seconds)` is called about once a second. If it returns True, all commands are ended, with checkpoints.
         Captures that are added meanwhile are trained, too.
@@ -231,7 +231,7 @@ def _progress(run: Path) -> tuple[int, int]:
 
 
 def _settled(capture: Path) -> bool:
-    """Return whether nothing in a folder has changed for SETTLED seconds, so that its files are not being copied still."""
+    """Return whether a folder's files are complete: nothing has changed for SETTLED seconds, so that nothing is being copied still."""
     try:
         changed = max(path.stat().st_mtime for path in [capture, *capture.rglob("*")])
     except OSError:

@@ -1,6 +1,7 @@
-"""Copy a step's files to a machine of a cluster that shares no folder with the batch's, and copy back what the step makes.
+"""Copy a step's files to a machine that does not share the batch's folder, and copy back what the step makes.
 
-A copy has the path of what it copies, for commands and run folders name files by their paths. The bytes go through Ray's object store.
+A copy has the same path as its original, because commands and run folders name files by their paths. The bytes go through Ray's object
+store.
 """
 
 import os
@@ -28,7 +29,7 @@ Listing = dict[str, tuple[int, int]]
 
 
 def list_files(root: Path) -> Listing:
-    """List the files in a folder and in those that it links to. A file is listed under the name "."; what is not there has no files."""
+    """List the files in a folder and in those that it links to. A file is listed under the name ".". A missing path has no files."""
     if root.is_file():
         return {".": _facts(root)}
     found = {}
@@ -49,14 +50,14 @@ def _facts(file: Path) -> tuple[int, int]:
 
 
 class Depot:
-    """Read and write files of the batch's machine for steps on others. Ray runs it as an actor there."""
+    """Read and write files on the batch's machine for steps on other machines. Ray runs this as an actor on the batch's machine."""
 
     def __init__(self, mark: Path):
-        """Remember `mark`, a file: who sees it shares the folder of the batch with this machine."""
+        """Remember `mark`, a file. A machine that sees it shares the folder of the batch with this machine."""
         self._mark, self._tickets = mark, Counter()
 
     def begin(self, roots: tuple[Path, ...]) -> tuple[Path, dict[Path, int]]:
-        """Return the mark, and tickets for writing in folders. Earlier ones for them, of steps that Ray has given up, count no more."""
+        """Return the mark, and tickets for writing in folders. Earlier tickets, of steps that Ray has given up, are no longer valid."""
         self._tickets.update(roots)
         return self._mark, {root: self._tickets[root] for root in roots}
 
@@ -89,12 +90,12 @@ class Depot:
 
 @contextmanager
 def at_hand(reads: tuple[Path, ...], writes: tuple[Path, ...], depot: Any) -> Iterator[None]:
-    """Have files and folders of the batch's machine here for a `with` block, and what the block writes there.
+    """Copy files and folders of the batch's machine to this one for a `with` block, and copy back what the block writes.
 
-    Where the folder of the batch is shared, and without a `depot`, nothing is copied. Otherwise, the files are copied before the block, and
-    what has changed in `writes` is copied back while it runs, and after it. The copies stay, for the next step: see `remove_copies`.
+    Nothing is copied if the folder of the batch is shared, or without a `depot`. Otherwise, files are copied before the block, and changes
+    in `writes` are copied back during the block and after it. The copies stay for the next step: see `remove_copies`.
 
-    Raises InputError if a folder is here, is no copy, and has other files, and TryAgain if the batch's machine does not answer.
+    Raises InputError if a folder exists here that is no copy and has other files. Raises TryAgain if the batch's machine does not answer.
     """
     if depot is None:
         yield
@@ -129,12 +130,15 @@ def remove_copies(roots: list[Path], mark: Path) -> None:
 
 
 def _mark(root: Path) -> Path:
-    """Return the file that marks a folder of this machine as a copy. It is beside the folder, for what is in it is the step's."""
+    """Return the file that marks a folder of this machine as a copy.
+
+    It lies beside the folder, because the folder's contents belong to the step.
+    """
     return root.with_name(f".{root.name}.refgs-copy")
 
 
 def _fetch(root: Path, depot: Any) -> Listing:
-    """Make the copy of a file or folder like what it copies. Returns the listing of both."""
+    """Update the copy of a file or folder from its original. Returns the listing of both."""
     there, here = _get(depot.listing.remote(root)), list_files(root)
     if not _mark(root).exists():
         if here and here == there:  # this folder is shared
@@ -170,17 +174,17 @@ def _write(file: Path, parts: Iterator[bytes], time: int) -> None:
 
 
 class _Back:
-    """Copy back what changes in folders, until `end` is called. It has a thread, for Ray interrupts steps that are stopped."""
+    """Copy back what changes in folders, in a thread, until `end` is called. A thread is used because Ray interrupts stopped steps."""
 
     def __init__(self, folders: dict[Path, tuple[int, Listing]], depot: Any):
-        """`folders` are the tickets of the folders, and what the batch's machine has in each."""
+        """Start to copy. `folders` has the ticket of each folder, and the listing that the batch's machine has of it."""
         self._folders, self._depot, self._error = folders, depot, None
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def end(self) -> None:
-        """Copy for the last time. Raises what copying raised."""
+        """Copy for the last time. Raises any error that copying has raised."""
         self._over.set()
         while self._thread.is_alive():
             with suppress(KeyboardInterrupt):  # Ray says more than once that a step is to stop
@@ -221,7 +225,7 @@ class _Back:
 
 
 def _get(reference: Any) -> Any:
-    """Wait for a value. Raises what made it fail, and TryAgain if the machine that has it does not answer."""
+    """Wait for a value. Raises the error with which it failed, and TryAgain if the machine that has it does not answer."""
     import ray
     import ray.exceptions
 

@@ -71,8 +71,9 @@ class Engine:
     def submit(self, step: Step, memory: int, card: float, before: list[tuple[Any, bool]]) -> Any:
         """Hand a step to Ray. Returns a reference to its outcome.
 
-        `memory` is what it needs, in bytes, and `card` the share of a CUDA card, 0 … 1. `before` lists what it waits for: references or
-        outcomes, and whether those steps are optional. A step that needs more memory than any machine has asks for what one has.
+        `memory` is the memory that it needs, in bytes, and `card` its share of a CUDA card, 0 … 1. `before` lists the steps for which it
+        waits: their references or outcomes, and whether they are optional. No step asks for more than nine tenths of the memory that a
+        machine has.
         """
         how = {
             "num_cpus": self._cores,
@@ -176,8 +177,8 @@ def _card_bytes() -> int:
 def started(address: str | None, cores: int | None, workers: int | None) -> Iterator[Engine]:
     """Start Ray on this machine for a `with` block, or join the cluster at `address`, HOST:PORT of its head.
 
-    `cores` is the number of cores of each step, one if it is None. `workers` steps run at once here, as many as there are cores for if it
-    is None.
+    `cores` is the number of cores of each step; None means one. `workers` is the number of steps that run at once on this machine; None
+    means as many as there are cores for.
 
     Raises InputError if Ray is missing or another version, or if no cluster is there, and TryAgain if Ray cannot start here.
     """
@@ -202,7 +203,10 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
 
 
 def _keep_ignoring(ray: Any) -> None:
-    """Ignore SIGTERM again half way through Ray's shutdown: with its log, Ray gives SIGTERM back to the system, to which it means death."""
+    """Ignore SIGTERM again half way through Ray's shutdown.
+
+    When Ray closes its log, it restores the system's handler of SIGTERM, which ends the process.
+    """
     node = ray._private.worker._global_node
     if node is None or threading.current_thread() is not threading.main_thread():
         return
@@ -217,9 +221,10 @@ def _keep_ignoring(ray: Any) -> None:
 
 @contextmanager
 def _signals(handler: Any) -> Iterator[None]:
-    """Let `handler`, unless it is None, handle SIGINT and SIGTERM in a `with` block. After it, their handlers are those of before.
+    """Let `handler` handle SIGINT and SIGTERM in a `with` block, and restore the earlier handlers after it.
 
-    Ray sets one for SIGTERM when it starts. Does nothing outside of the main thread.
+    The earlier ones must be restored because Ray sets its own for SIGTERM when it starts. If `handler` is None, only restore them. Does
+    nothing outside of the main thread.
     """
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
     before = {number: signal.getsignal(number) for number in numbers}
@@ -234,7 +239,7 @@ def _signals(handler: Any) -> Iterator[None]:
 
 
 def _make_folder() -> Path:
-    """Make a folder for Ray's sockets and logs, which is removed at exit. Remove those that killed batches have left."""
+    """Make a folder for Ray's sockets and logs, which is removed at exit. Remove the folders that killed batches have left."""
     parent = Path("/tmp" if os.name == "posix" else tempfile.gettempdir())  # names of sockets must be short
     for file in parent.glob(f"refgs-*/{LOCKED}"):
         with suppress(OSError, Timeout):
@@ -250,7 +255,7 @@ def _make_folder() -> Path:
 
 
 def _import_ray(cluster: bool) -> Any:
-    """Import Ray, which reads the environment then."""
+    """Import Ray, after setting the environment variables that it reads on import."""
     os.environ.update({name: value for name, value in ENVIRONMENT.items() if name not in os.environ})
     if not cluster:  # nobody else may use this Ray, and no token need be kept for it
         os.environ.update({"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)})

@@ -14,7 +14,7 @@ OPTIONAL = ("masks",)  # steps whose failure counts only if the training fails, 
 
 
 class Node(NamedTuple):
-    """Hold a step, and the names of the steps that it follows: those that must succeed, and those that may fail."""
+    """Hold a step, the names of the earlier steps that must succeed, and the names of earlier steps that may fail."""
 
     step: Step
     after: tuple[str, ...] = ()
@@ -24,8 +24,8 @@ class Node(NamedTuple):
 def steps_of(job: Job, out: Path, device: str) -> list[Node]:
     """List the steps of a training into `out`, each after those that it follows.
 
-    Masks may fail: the training then takes all that the photos show, as `refgs train` does. No two steps work in the run at once: each
-    that locks it removes what others are writing, as if killed processes had left it.
+    Masks may fail. Then the training reconstructs all that the photos show, as `refgs train` does. No two steps work in a run at once,
+    because a step that locks the run removes files that others are writing, as if killed processes had left them.
     """
     run, capture, ask = (out / job.name).resolve(), str(job.capture), job.ask
     logs = run.parent / LOGS

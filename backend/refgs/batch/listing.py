@@ -1,4 +1,4 @@
-"""Read what a batch is to train: a list of captures and settings, or a folder of captures. It is checked before anything starts."""
+"""Read the trainings of a batch from a list of captures and settings, or from a folder of captures, and check them before they start."""
 
 import os
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ class Ask(BaseModel):
     set: list[str] = []
 
     def under(self, above: "Ask") -> "Ask":
-        """Return what this line asks for, and what the line `above` asks for where this one is silent."""
+        """Return the options of this line. Where it has none, take those of the line `above`."""
         preset, minutes = self.preset or above.preset, self.minutes or above.minutes
         return Ask(preset=preset, minutes=minutes, set=[*above.set, *self.set])
 
@@ -59,7 +59,7 @@ class Job(NamedTuple):
     ask: Ask
 
     def settings(self) -> Settings:
-        """Load the settings of the training. Those that are chosen for a time are not known: the preset `standard` stands for them."""
+        """Load the settings of the training. If they will be chosen for a time, return those of the preset `standard` instead."""
         return load_settings(self.ask.preset or "standard", self.ask.set)
 
 
@@ -92,7 +92,10 @@ def _jobs_of_folder(source: Path, out: Path, ask: Ask) -> Iterator[Job]:
 
 
 def _jobs_of_list(file: Path, ask: Ask, above: tuple[Path, ...]) -> Iterator[Job]:
-    """Make the trainings of a list and of those that it includes. `above` are the lists that include it. Folders are beside the list."""
+    """Make the trainings of a list and of the lists that it includes. `above` are the lists that include it.
+
+    Folders are relative to the list.
+    """
     file = Path(os.path.realpath(file))
     if file in above:
         raise InputError(f"{above[-1]} includes {file}, which includes it: take one of them out")
@@ -119,7 +122,7 @@ def _beside(file: Path, name: str) -> Path:
 
 
 def _check_unique(source: Path, out: Path, jobs: list[Job]) -> None:
-    """Check the names of runs, and that each capture is one line and each run one training."""
+    """Check the names of runs. Check that no capture is listed twice, and no run belongs to two trainings."""
     names: dict[Path, str] = {}
     runs: dict[str, Job] = {}
     for job in jobs:

@@ -1,4 +1,4 @@
-"""Write a batch's table, a row a run with its state, figures and what failed: as a page, and as JSON for other programs."""
+"""Write a batch's table: as a page, and as JSON for other programs. Each run has a row with its state, figures and failure."""
 
 import base64
 import json
@@ -22,11 +22,11 @@ SHOWN = ("psnr", "ssim", "flip", "splats")
 
 
 class Row(NamedTuple):
-    """Hold what the tables say of a run.
+    """Hold a run's row in the tables.
 
-    `state` is "waiting", "running", "done", "failed" or "stopped". A run that runs is at the `step`, of which `part`, 0 … 1, is done, or
-    None if that is not known. `what` says in one line what failed, as `log` does. `figures` are its metrics, `picture` its first held-out
-    view as rendered.
+    `state` is "waiting", "running", "done", "failed" or "stopped". A running run is at the `step`, of which the fraction `part` is done, 0
+    … 1, or None if that is not known. `what` says in one line what failed, and `log` is the file that says more. `figures` are its metrics,
+    and `picture` is its first held-out view as rendered.
     """
 
     name: str

@@ -38,12 +38,12 @@ class Step(NamedTuple):
 
     @property
     def running(self) -> Path:
-        """Return the file that is there while the step runs."""
+        """Return the file that exists while the step runs."""
         return self.log.with_suffix(".running")
 
 
 class Outcome(NamedTuple):
-    """Say how a step ended: its exit status, its seconds, the machine, and one line if it failed.
+    """Hold how a step ended: its exit status, its seconds, the machine, and one line if it failed.
 
     The status is None if the step was not run, because one before it failed.
     """
@@ -55,11 +55,11 @@ class Outcome(NamedTuple):
 
 
 class TryLater(Exception):
-    """Raised for a step that may succeed if it is run again. Ray does so, on any machine."""
+    """Report that a step may succeed if it is run again. Ray then runs it again, on any machine."""
 
 
 def recorded(step: Step) -> Outcome | None:
-    """Return the outcome of a step that was done before, None if it is not done, or if its command was another."""
+    """Return the outcome of a step that was done before. Return None if it was not done, or if its command was different."""
     from refgs.formats.progress import Record
     from refgs.formats.validate import read_json
 
@@ -118,7 +118,7 @@ def _run_and_record(step: Step, cores: int) -> Outcome:
 
 
 def _call(step: Step, cores: int, log) -> tuple[int, str]:
-    """Run the command of a step, and return its exit status and what it printed. However this call ends, the command ends with it.
+    """Run the command of a step. Return its exit status and its output. However this call ends, the command ends with it.
 
     The command ends when its input closes, which the system does if this process is killed.
     """
@@ -146,7 +146,7 @@ def _call(step: Step, cores: int, log) -> tuple[int, str]:
 
 
 def _line(printed: str, status: int) -> str:
-    """Return the one line that says why a command failed: the last that begins with "refgs: ", as the command line prints errors."""
+    """Return the line that says why a command failed: its last line that begins with "refgs: ", as the command line prints errors."""
     lines = [line.removeprefix("refgs: ") for line in printed.splitlines() if line.startswith("refgs: ")]
     if status < 0:
         return f"killed by signal {-status}"

@@ -1,9 +1,9 @@
-"""Find the plane that an object stands on or hangs on, and learn what this plane looks like, so that it can be told from the object.
+"""Find the plane that an object stands on or hangs on, and learn its colours, so that it can be told from the object.
 
-The photos are warped onto the plane, and each texel gets the median of the photos that see it: the object hides another part of the plane
-in each photo. A pixel whose colour is not the one that its texel predicts is not plane. This holds where object and plane share colours.
-Shadows that stand still are part of the texture. What moves, as a reflection in a shiny floor, differs between photos, so that its texels
-are uncertain.
+The photos are warped onto the plane. Each texel gets the median of the photos that see it, because the object hides another part of the
+plane in each photo. A pixel is not plane if its colour is not the one that its texel predicts. This works even where object and plane share
+colours. Shadows that stand still are part of the texture. Things that move, such as reflections in a shiny floor, differ between photos, so
+that their texels are uncertain.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ GRAZING = 0.15  # sine of the angle to the plane, below which a photo's pixels s
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """Plane `normal` @ p = `distance`. The object is where this is greater."""
+    """Hold the plane `normal` @ p = `distance`. The object is on the side where `normal` @ p is greater."""
 
     normal: np.ndarray
     distance: float
@@ -48,8 +48,8 @@ def find_plane(
 ) -> Plane | None:
     """Find the plane that carries the object: a floor or a wall with many structure-from-motion points, and hardly any behind.
 
-    `centre` and `radius` are a ball about the object, `up` is the world's up direction, and `positions` (N, 3) are the cameras', which all
-    are on the object's side. Return None if there is no such plane.
+    `centre` and `radius` are a ball around the object, and `up` is the world's up direction. `positions` (N, 3) are those of the cameras,
+    which all are on the object's side. Return None if there is no such plane.
     """
     near = points[np.linalg.norm(points - centre, axis=1) < 3 * radius]
     if len(near) < 50:
@@ -84,9 +84,9 @@ def find_plane(
 
 
 class Backdrop:
-    """Colours of a plane, and how much they differ between photos, on a square grid of SIDE² texels around the object.
+    """Hold the colours of a plane, and how much they differ between photos, on a square grid of SIDE² texels around the object.
 
-    Colours are logarithms of 8-bit values in steps, so that exposure and white balance of a photo are an offset for each channel.
+    Colours are logarithms of 8-bit values, in steps. So a photo's exposure and white balance are an offset for each channel.
     """
 
     def __init__(self, plane: Plane, centre: np.ndarray, radius: float):
@@ -100,7 +100,7 @@ class Backdrop:
         self.to_world[3, 2] = 1
 
     def before(self, points: np.ndarray) -> np.ndarray:
-        """Mark the points (N, 3) that are before the plane, not in it."""
+        """Mark the points (N, 3) that lie in front of the plane, not in it."""
         return self.plane.height(points) > ABOVE * self.radius
 
     def learn(self, images: list[np.ndarray], cameras: list[Camera], hidden: list[np.ndarray]) -> None:
@@ -132,10 +132,11 @@ class Backdrop:
         self.color, self.spread = color.reshape(SIDE, SIDE, 3), spread.reshape(SIDE, SIDE, 3)
 
     def likelihood(self, image: np.ndarray, camera: Camera, hidden: np.ndarray) -> np.ndarray:
-        """Return how likely the bare plane has each pixel's colour, (H, W) float32: the mass in a cell of BIN.
+        """Return how well each pixel's colour fits the bare plane, as float32 (H, W).
 
-        Where the texel's colour is not known, as below the object, it is minus the odds of object to plane. It is NaN where the photos do
-        not show the plane.
+        It is the probability that the plane has a colour in the pixel's cell of the colour space, which has the size BIN. Where the texel's
+        colour is not known, as below the object, it is instead the negative of the odds of object to plane. Where the photos do not show
+        the plane, it is NaN.
 
         The photo's exposure and noise are measured on the pixels that are not `hidden`.
         """
@@ -189,9 +190,10 @@ class Backdrop:
 def _median(
     stack: np.ndarray, used: np.ndarray, offset: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the median (N, 3) and the spread (N, 3) of texels over the photos that are `used` (N, photos), and the photos' exposures.
+    """Return the median (N, 3) and the spread (N, 3) of texels over photos, and the photos' exposures (3, photos).
 
-    `stack` (N, 3, photos) has the texels' logarithms. Exposures (3, photos) are fitted unless `offset` gives them.
+    `stack` (N, 3, photos) has the texels' logarithms, and `used` (N, photos) tells which of them count. Exposures are fitted unless
+    `offset` gives them.
     """
     count = used.sum(axis=1)
     values = np.where(used[:, None], stack, np.float32(np.nan))

@@ -9,7 +9,7 @@ from refgs.settings import RegionSettings
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """Box with any position, size and rotation.
+    """Hold a box with any position, size and rotation.
 
     `matrix` (4, 4) maps the cube from −1 to 1 onto the box. Its columns are three vectors, each half an edge of the box, and the centre.
     """

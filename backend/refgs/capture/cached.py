@@ -1,6 +1,7 @@
 """Load a capture's photos for training. Many large ones are written into files and mapped: the system can then reclaim their memory.
 
-A photo's files are named after all that their pixels depend on. A resumed training finds those that still fit, and makes the others anew.
+A photo's files are named by a hash of all that its pixels depend on. A resumed training reuses the files that still fit, and makes the
+others anew.
 """
 
 import hashlib
@@ -25,8 +26,8 @@ LARGE = 500e6  # bytes of all photos of a capture, from which on they are cached
 def load_views(views: list[View], max_side: int, folder: Path) -> list[LoadedView]:
     """Load photos for training as `load_view` does. If they take more than LARGE bytes, cache them in `folder`.
 
-    The arrays of a cached photo are mapped from files. A change of their values stays in memory until `release_memory` is called. Where the
-    disk has no room, photos are held in memory. Raises InputError naming the photo that cannot be read.
+    The arrays of a cached photo are mapped from files. Changes of their values stay in memory until `release_memory` is called. If the disk
+    is full, photos are held in memory. Raises InputError naming the photo that cannot be read.
     """
     cameras = [view.camera.fitted(max_side) for view in views]
     if sum(4 * camera.width * camera.height for camera in cameras) <= LARGE:
@@ -47,7 +48,7 @@ def load_views(views: list[View], max_side: int, folder: Path) -> list[LoadedVie
 def reduced_views(views: list[LoadedView], factor: int, folder: Path) -> list[LoadedView]:
     """Reduce the sides of loaded photos by a factor, in linear light as `load_view` does. If `folder` exists, cache them there, too.
 
-    Of mapped photos, one at a time is in memory.
+    If photos are mapped, only one at a time is in memory.
     """
     found = []
     for number, view in enumerate(views):
@@ -60,7 +61,7 @@ def reduced_views(views: list[LoadedView], factor: int, folder: Path) -> list[Lo
 
 
 def release_memory(views: list[LoadedView]) -> None:
-    """Take mapped photos out of the process's memory, on Linux. They are mapped anew, from the system's file cache, when they are used."""
+    """Free the memory of mapped photos, on Linux. When they are used again, they are mapped anew from the system's file cache."""
     if not hasattr(mmap, "MADV_DONTNEED") or sys.platform != "linux":
         return
     for view in views:
@@ -100,7 +101,7 @@ def _read(camera: Camera, folder: Path, name: str) -> LoadedView | None:
 
 
 def _mapped(file: Path, shape: tuple[int, ...], *kinds: type) -> np.ndarray:
-    """Map an array from a file. Raises any exception if it is damaged, or not of this shape and of one of these types."""
+    """Map an array from a file. Raises any exception if it is damaged, or has another shape, or none of these types."""
     values = np.asarray(np.load(file, mmap_mode="c"))  # not "r", as torch warns of arrays that it must not write
     if values.shape != shape or values.dtype not in kinds:
         raise ValueError("another array")

@@ -73,7 +73,7 @@ def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
 
 
 class _Statistics:
-    """Statistics of one photo. If it has a mask, only pixels inside the mask are measured.
+    """Hold statistics of one photo. If it has a mask, only pixels inside the mask are measured.
 
     `coverage` is the fraction of pixels inside the mask, None without a mask. `clipped` is the fraction of clipped pixels. `brightness` is
     the mean 8-bit value, and `brightest` the value that 99 % do not exceed. `grey` is True if the photo has no colour. `sharpness` comes
@@ -165,7 +165,7 @@ def _masks(capture: Capture, statistics: list[_Statistics]) -> str:
 
 
 def _priors(capture: Capture) -> list[str]:
-    """Say for how many photos there are normals and depth from other programs. Return no line if there are none."""
+    """Report for how many photos there are normals and depth from other programs. Return no line if there are none."""
     lines = []
     for name, field in FOLDERS.items():
         if count := sum(getattr(view, field) is not None for view in capture.train_views):
@@ -174,7 +174,7 @@ def _priors(capture: Capture) -> list[str]:
 
 
 def _guessed_object(capture: Capture) -> list[str]:
-    """Say where a training of a capture without masks looks for the object. Return no line if there are masks, or if it makes none."""
+    """Report where a training without masks looks for the object. Return no line if there are masks, or if the training makes none."""
     if any(view.masked for view in capture.views) or capture.layout in Z_UP or capture.box is not None:
         return []
     from refgs.capture.masks import (  # imports scipy, which a wrong folder should not wait for

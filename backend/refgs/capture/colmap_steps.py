@@ -129,7 +129,7 @@ def _simplify(camera) -> None:
 
 
 def _write_mask(photo: Path, mask: Path, out: Path) -> None:
-    """Write a photo's mask as COLMAP reads it: black and white, and lying as the photo is stored."""
+    """Write a photo's mask as COLMAP reads it: black and white, in the orientation in which the photo is stored."""
     header, pixels = read_header(photo), read_mask(mask)
     if pixels.shape == header.upright[::-1]:
         pixels = np.rot90(pixels, header.turns)
@@ -191,8 +191,8 @@ def map_one_by_one(photos: list[Path], database: Path, progress: Callable) -> li
 def map_at_once(photos: list[Path], database: Path) -> list[Any]:
     """Compute all cameras together (GLOMAP). Return the models as `map_one_by_one` does.
 
-    This links photos that share too little to be placed one after the other. Photos that it places by their direction alone, and not by
-    points that several of them show, lose their cameras: how far apart they are was not known.
+    This links photos that share too little to be placed one after the other. Some photos are placed by their direction alone, and not by
+    points that several photos show. They lose their cameras, because their distance is not known.
     """
     import pycolmap
 
@@ -208,10 +208,10 @@ def map_at_once(photos: list[Path], database: Path) -> list[Any]:
 
 
 def _tied(model: Any) -> set[int]:
-    """Return the largest set of a model's images that common points hold together, grown from the two that share most points.
+    """Return the largest set of a model's images that are tied by common points. It grows from the two images that share most points.
 
-    An image is tied if it shows TIED points that two tied images show. Otherwise nothing says how far away it is: relative poses of two
-    photos have no scale.
+    An image is tied if it shows TIED points that two tied images show. Otherwise its distance is not known, because the relative pose of
+    two photos has no scale.
     """
     shown = {
         number: {seen.point3D_id for seen in model.image(number).get_observation_points2D()}
@@ -248,8 +248,8 @@ def epipolar_distance(ours: np.ndarray, theirs: np.ndarray, pose: np.ndarray) ->
 def unexplained_part(model: Any, database: Path) -> float:
     """Return the fraction of feature matches that the cameras of a model (a pycolmap.Reconstruction) do not explain.
 
-    A match is explained if its points are at most MATCH_TOLERANCE pixels from their epipolar lines, and both its photos have cameras: if an
-    object turns before a still room, some photos may follow the object and the others, which follow the room, get no camera.
+    A match is explained if its points are at most MATCH_TOLERANCE pixels from their epipolar lines, and both its photos have cameras. The
+    second condition counts if an object turns before a still room: photos that follow the room may get no camera.
     """
     import pycolmap
 

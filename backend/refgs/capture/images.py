@@ -47,7 +47,7 @@ EXR_WHITE = (
 
 @dataclass(frozen=True, eq=False)
 class LoadedView:
-    """Pixels of a photo as loaded for training: `image` (H, W, 3), sRGB-encoded, and `alpha` (H, W) uint8, None without a mask.
+    """Hold the pixels of a photo for training: `image` (H, W, 3), sRGB-encoded, and `alpha` (H, W) uint8, None without a mask.
 
     `image` has the dtype uint8 or uint16, and `white` is the code of white in it. A pixel with the dtype's largest code is clipped: its
     true radiance may be higher. Colours are not premultiplied by alpha. `camera` is the pinhole camera for this image size. If the photo
@@ -76,7 +76,7 @@ class LoadedView:
 
 
 class Header(NamedTuple):
-    """Size of an image as stored, in pixels; whether it has alpha; and the clockwise quarter turns that make it upright (EXIF)."""
+    """Hold an image's size as stored, in pixels, whether it has alpha, and the clockwise quarter turns that make it upright (EXIF)."""
 
     width: int
     height: int
@@ -101,9 +101,10 @@ def read_header(path: Path) -> Header:
 
 
 def read_focal_length(path: Path) -> float | None:
-    """Return a photo's focal length in pixels by its EXIF: that for 35 mm film, else in mm with the pixels per mm of the sensor.
+    """Return a photo's focal length in pixels, from its EXIF. Return None if EXIF does not give it.
 
-    Return None if EXIF has neither. Raises InputError naming the file.
+    The focal length for 35 mm film is preferred. Otherwise the focal length in mm is multiplied by the sensor's pixels per mm. Raises
+    InputError naming the file.
     """
     size = read_header(path)[:2]
     try:
@@ -135,9 +136,9 @@ def read_image(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | No
 
 
 def read_codes(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | None, int]:
-    """Decode an image file to RGB codes (H, W, 3), uint8 or uint16 as the file has them, alpha (H, W) uint8 or None, and white's code.
+    """Decode an image file to RGB codes (H, W, 3), alpha (H, W) uint8 or None, and the code of white.
 
-    The arguments and errors are those of `read_image`.
+    Codes are uint8 or uint16, as in the file. The arguments and errors are those of `read_image`.
     """
     if _is_raw(path):
         width, height, turns = raw.read_raw_header(path)
@@ -163,7 +164,7 @@ def read_codes(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | No
 
 
 def _exr_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Decode an EXR to 16-bit codes (H, W, 3) and alpha (H, W) uint8 or None. What is not a number is black."""
+    """Decode an EXR to 16-bit codes (H, W, 3) and alpha (H, W) uint8 or None. NaN becomes black."""
     pixels = np.nan_to_num(read_exr(path))
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, axis=2)
@@ -175,9 +176,10 @@ def _exr_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def write_for_colmap(path: Path, out: Path) -> bool:
-    """Write a photo's pixels to the JPEG `out` if COLMAP cannot read them: HEIC, WebP, RAW, EXR, and TIFF that has to be turned upright.
+    """Write a photo's pixels to the JPEG `out` if COLMAP cannot read them: HEIC, WebP, RAW, EXR, or TIFF that is not stored upright.
 
-    Return whether it was written. The pixels are turned as `Header` says that they are stored. Raises InputError naming the file.
+    Return whether the JPEG was written. It has the orientation in which `Header` says that the pixels are stored. Raises InputError naming
+    the file.
     """
     if _is_raw(path) or _is_exr(path):
         stored = np.rot90(read_image(path)[0], read_header(path).turns)
@@ -209,7 +211,8 @@ def read_mask(path: Path, below: float | None = None) -> np.ndarray:
 def read_alpha(view: View) -> np.ndarray | None:
     """Return a photo's mask (H, W) uint8, None if it has none. It is upright, not undistorted, and has the photo's full size.
 
-    A mask file without an EXIF orientation may lie as its photo is stored. If only that fits the photo's size, it is turned with the photo.
+    A mask file without an EXIF orientation may be stored in its photo's orientation. If it fits the photo's size only then, it is turned
+    with the photo.
     """
     if view.mask_path is None:
         return read_image(view.image_path)[1] if view.has_alpha else None
@@ -225,7 +228,7 @@ def _file_mask(view: View, file: Path) -> np.ndarray:
 
 
 def load_view(view: View, max_side: int | None = None) -> LoadedView:
-    """Load a photo for training: decode it, apply its mask, undistort it, reduce its longer side to `max_side` pixels (None: full size).
+    """Load a photo for training: decode it, apply its mask, undistort it, and reduce its longer side to `max_side` pixels, if given.
 
     When a photo is reduced, linear radiance is averaged over each new pixel's area, as a coarser sensor would do. The average is weighted
     by alpha, so that colours outside the mask do not bleed into its edge. A much larger JPEG is first reduced by its decoder, to SPARE
@@ -314,7 +317,7 @@ def _decode(picture: Image.Image, path: Path) -> Image.Image:
 
 
 def _as_array(picture: Image.Image) -> np.ndarray:
-    """Copy a picture to an array (H, W, C) uint8, in strips: Pillow makes a second copy of what it hands over."""
+    """Copy a picture to an array (H, W, C) uint8, in strips, because Pillow copies once more what it returns."""
     pixels = np.empty((picture.height, picture.width, len(picture.getbands())), np.uint8)
     for top in range(0, picture.height, ROWS):
         bottom = min(top + ROWS, picture.height)

@@ -22,7 +22,7 @@ ALL = slice(None)
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics and distortion coefficients of a photo: `radial` is k1..k4, `tangential` is p1, p2.
+    """Hold the intrinsics and distortion coefficients of a photo: `radial` is k1..k4, `tangential` is p1, p2.
 
     Focal lengths and principal point are in pixels; pixel centres are at half-integers.
     """

@@ -1,8 +1,8 @@
 """Make masks for a capture that has cameras but no masks, and remake them when an artist's strokes change.
 
-Strokes are pictures CAPTURE/strokes/NAME.png with transparency, drawn on the upright photo: white is the object, black is not, and
-transparent says nothing. Masks that the program made are known by their hashes in masks/made.json. All other masks are the artist's.
-They are kept, and are evidence for the other photos.
+Strokes are pictures CAPTURE/strokes/NAME.png with transparency, drawn on the upright photo. White marks the object, black marks the rest,
+and transparent pixels say nothing. The hashes of masks that the program made are in masks/made.json. All other masks are the artist's: they
+are kept, and are evidence for the other photos.
 """
 
 import hashlib
@@ -54,17 +54,20 @@ def make_masks(
 ) -> dict[str, Any]:
     """Make the masks of a capture's photos, and write them to its folder `masks`.
 
-    `wanted` may set a box about the object, as for `read_capture`; its up direction is not used. Without a box, the object is guessed
+    `wanted` may set a box around the object, as for `read_capture`. Its up direction is not used. Without a box, the object is guessed
     (`guess_box`), and the guess is reported as the event "region". `report(event, facts)` is also called with "progress" and "warning".
-    `model` is an ONNX file (`SalienceModel`) that judges pixels in place of their colours.
+    `model` is an ONNX file (`SalienceModel`) that finds the object's pixels. Without it, colours do.
 
-    Returns a dict: `photos`, `made` and `kept` are numbers of masks, `objects` is the number of separate objects, and `region` is the box
-    about them, as settings for a training of the capture with its new masks. These masks may move the capture's frame: `moved` (4, 4), a
-    list, is p_new = moved @ p.
+    Returns a dict:
 
-    All masks are written together at the end; an interrupted call leaves those of before. Raises InputError if all photos have masks by the
-    artist, if these are all white, if strokes or the model do not fit, or if nothing is found, and ReadOnlyError if the folder cannot be
-    written to.
+    - `photos`, `made`, `kept`: the numbers of photos, of new masks and of kept masks.
+    - `objects`: the number of separate objects.
+    - `region`: the box around them, as settings for a training with the new masks.
+    - `moved`: the matrix (4, 4), as a list, by which the new masks move the capture's frame: p_new = moved @ p.
+
+    All masks are written together at the end. An interrupted call leaves the earlier masks. Raises InputError if the artist has made all
+    masks already, if the artist's masks are all white, if strokes or the model do not fit, or if nothing is found. Raises ReadOnlyError if
+    the folder cannot be written to.
     """
     return with_masks(read_files(folder), wanted, report, model)[1]
 
@@ -75,7 +78,7 @@ def with_masks(
     report: Report,
     model: Path | None = None,
 ) -> tuple[CaptureFiles, dict[str, Any]]:
-    """Make masks as `make_masks` does, of a capture that was read. Return the capture with its new masks, and what `make_masks` returns."""
+    """Make masks of a capture that is read already. Return the capture with its new masks, and the dict that `make_masks` returns."""
     folder = files.folder
     judge = _Judge(SalienceModel(model)) if model is not None else None
     capture = to_run_frame(files, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
@@ -186,7 +189,7 @@ def region_settings(box: Box) -> list[str]:
 
 
 def moved_region(wanted: RegionSettings, moved: list[list[float]]) -> RegionSettings:
-    """Return a box in the frame that new masks have moved, by the matrix (4, 4) that `make_masks` returns as `moved`."""
+    """Return a box in the frame that new masks have moved. `moved` (4, 4) is what `make_masks` returns."""
     scale = sum(row[0] ** 2 for row in moved[:3]) ** 0.5
     centre = tuple(sum(a * b for a, b in zip(row, (*wanted.centre, 1.0), strict=True)) for row in moved[:3])
     return wanted.model_copy(update={"centre": centre, "size": tuple(scale * edge for edge in wanted.size)})
@@ -227,7 +230,7 @@ def _root(capture: Capture) -> Path:
 
 
 def _inner(view: View, root: Path) -> Path:
-    """Return a photo's path in the folder of photos, which is also that of its mask in `masks`."""
+    """Return a photo's path relative to the folder of photos. Its mask has the same relative path in `masks`."""
     if not view.image_path.is_relative_to(root):
         raise InputError(f"{view.image_path}: the photo is not in the capture's folder {root}. Move it there.")
     path = view.image_path.relative_to(root)
@@ -257,7 +260,7 @@ def _hashes(root: Path) -> set[str]:
 
 
 def _choose(views: list[View], root: Path) -> list[View]:
-    """Choose the photos to carve by: evenly, and all that the artist said something about."""
+    """Choose the photos to carve by: some evenly spaced ones, and all for which there are masks or strokes by the artist."""
     every = max(1, -(-len(views) // CARVED_BY))
     return [view for i, view in enumerate(views) if i % every == 0 or view.masked or _stroke_file(view, root)]
 
@@ -269,7 +272,7 @@ def _stroke_file(view: View, root: Path) -> Path | None:
 
 
 class _Judge:
-    """What a model finds in photos. Each photo is shown to it once, for it may take seconds."""
+    """Find objects in photos with a model. Each photo is given to the model only once, because that may take seconds."""
 
     def __init__(self, model: SalienceModel):
         self.model = model
@@ -286,7 +289,7 @@ class _Judge:
 
 
 def _load(view: View, root: Path, side: int, judge: _Judge | None) -> Photo:
-    """Load a photo, undistorted and reduced, with what the artist's mask or strokes and the model say about its pixels."""
+    """Load a photo, undistorted and reduced, with what the model and the artist's mask or strokes tell about its pixels."""
     loaded = load_view(view, side)
     known = np.zeros(loaded.image.shape[:2], np.int8)
     if loaded.alpha is not None:
@@ -298,7 +301,10 @@ def _load(view: View, root: Path, side: int, judge: _Judge | None) -> Photo:
 
 
 def _read_strokes(file: Path, view: View, camera: Camera) -> np.ndarray:
-    """Read an artist's strokes as int8 (H, W), on the undistorted photo of the size of `camera`: 1 object, −1 not, 0 nothing."""
+    """Read an artist's strokes as int8 (H, W): 1 is the object, −1 is not, 0 is unmarked.
+
+    They are undistorted and resized to `camera`, as the photo is.
+    """
     color, alpha = read_image(file)
     height, width = color.shape[:2]
     if abs(width / height * view.camera.height / view.camera.width - 1) > 0.02:
@@ -327,7 +333,7 @@ def _small_lens(lens: Lens, camera: Camera, small: Camera) -> Lens:
 
 
 def _to_photo(view: View, mask: np.ndarray) -> np.ndarray:
-    """Bring a mask of the undistorted, reduced photo to the photo as it is: upright, distorted, at full size."""
+    """Convert a mask of the undistorted, reduced photo to one of the photo as it is: upright, distorted, at full size."""
     width, height = view.camera.width, view.camera.height
     # A step at a reduced pixel becomes a smooth edge, cut in its middle and soft over a pixel.
     smooth = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.7)

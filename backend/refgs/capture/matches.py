@@ -33,11 +33,11 @@ class Matches(NamedTuple):
 
 
 def match_neighbours(views: list[LoadedView]) -> list[Matches]:
-    """Match some photos, spread over all, each with that of the nearest camera. Only pixels inside the masks are matched.
+    """Match some photos, evenly spread, each with the photo of the nearest camera. Only pixels inside the masks are matched.
 
-    The matches of a pair fit some epipolar geometry, whatever the cameras are. Pairs with hardly any are left out, and those of which most
-    fit none: seven matches always fit one, and so do some more by chance. A mirror's image is not at rest on the mirror, so what a mirror
-    shows may be among the matches.
+    The matches of a pair fit one epipolar geometry, whatever the cameras are. Pairs with hardly any matches are left out. So are pairs most
+    of whose matches fit none, because seven matches always fit one, and some more fit by chance. Mirror images may be among the matches,
+    although they are not at rest on the mirror.
     """
     if len(views) < 2:
         return []
@@ -54,10 +54,10 @@ def match_neighbours(views: list[LoadedView]) -> list[Matches]:
 
 
 def pixels_apart(matches: list[Matches], cameras: list[Camera]) -> float | None:
-    """Return how far matches are from their epipolar lines, in pixels of photos reduced to SIDE: the lower quartile of the pairs' medians.
+    """Return how far matches are from their epipolar lines, in pixels of photos reduced to SIDE.
 
-    The lower quartile, as a mirror's images contradict cameras that are right. Returns None if there are fewer than LEAST_PAIRS pairs.
-    `cameras` are those of the views that were matched, in their order.
+    The result is the lower quartile of the pairs' medians, because mirror images contradict correct cameras. It is None if there are fewer
+    than LEAST_PAIRS pairs. `cameras` are those of the matched views, in the same order.
     """
     medians = []
     for pair in matches:

@@ -53,7 +53,7 @@ WITH_MASKS = (
 
 
 class _Found(NamedTuple):
-    """Hold what COLMAP found: names of the photos that got a camera, the mean reprojection error (pixels), and what casts doubt on them.
+    """Hold the names of the photos that got a camera, the mean reprojection error in pixels, and reasons to doubt the cameras.
 
     `unexplained` is the fraction of feature matches that the cameras do not explain. `apart` are the names of photos that fit together but
     share nothing with those placed. `inside` says that only the pixels inside the masks were used.
@@ -210,7 +210,7 @@ def _run_colmap_in_child(
 
 
 def end_with_parent() -> None:
-    """Make this process, a child by `multiprocessing`, end as soon as its parent does, whatever it is doing then."""
+    """Make this child process end as soon as its parent does, even in the middle of its work."""
 
     parent = multiprocessing.parent_process()
 

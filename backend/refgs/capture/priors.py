@@ -1,4 +1,4 @@
-"""Read normals and depth that other programs guessed from single photos: priors, which training only leans on.
+"""Read priors: normals and depth that other programs guessed from single photos. Training uses them only early.
 
 They are files in the folders `normals` and `depth`, beside the folder `masks`. A file has its photo's name, as a mask has. Words that such
 programs append are allowed, as in `0001_pred.npy` for the photo `0001.jpg`.
@@ -53,10 +53,10 @@ def with_priors(views: list[View], root: Path) -> list[View]:
 
 
 def _find(views: list[View], root: Path, folder: Path) -> dict[View, Path]:
-    """Return the file of each training view that has any in `folder`. Of several, take the one whose suffix comes first in SUFFIXES.
+    """Return the file of each training view that has one in `folder`. If it has several, the one whose suffix is first in SUFFIXES counts.
 
-    As for masks, the first folder of a photo's path may be left out: `0001.png` is for `images/0001.jpg`. A name that two training photos
-    could have is for none, and one that only a held-out photo has is for that.
+    As for masks, the first folder of a photo's path may be left out: `0001.png` is for `images/0001.jpg`. A file is not used if its name
+    fits two training photos, or if it fits only a held-out photo.
     """
     named: dict[str, list[View]] = {}
     for view in sorted(views, key=lambda view: view.split != "train"):
@@ -84,7 +84,7 @@ def _preference(file: Path) -> tuple[int, int]:
 def load_normals(view: View) -> Prior | None:
     """Load the guessed normals of a view as unit vectors (H, W, 3), or return None if it has none.
 
-    They have the axes of the file, which are not known: x may point right or left, and so on. Raises InputError naming the file.
+    They have the file's axes, which are not known: x may point right or left, and so on. Raises InputError naming the file.
     """
     path = view.prior_normals
     if path is None:
@@ -106,7 +106,7 @@ def load_normals(view: View) -> Prior | None:
 def load_depth(view: View) -> Prior | None:
     """Load the guessed depth or disparity of a view (H, W), or return None if it has none.
 
-    Its scale and what its zero means are not known; 0 itself is taken for no value. Raises InputError naming the file.
+    Its scale and its zero point are not known. The value 0 means that nothing is known. Raises InputError naming the file.
     """
     path = view.prior_depth
     if path is None:
@@ -119,9 +119,9 @@ def load_depth(view: View) -> Prior | None:
 
 
 def _read(path: Path, channels: int) -> np.ndarray:
-    """Read a file of `channels` numbers a pixel as float32: (H, W, 3), or (H, W) for one. What is not finite or transparent becomes 0.
+    """Read a file with `channels` numbers per pixel as float32 (H, W, 3), or (H, W) for one. Values not finite or transparent become 0.
 
-    Values of integers are divided by the largest of their type.
+    Integers are divided by the largest value of their type.
     """
     if path.suffix.lower() in (".npy", ".npz"):
         values = _read_array(path, channels)

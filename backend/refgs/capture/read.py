@@ -75,7 +75,7 @@ def read_files(folder: Path) -> CaptureFiles:
 
 
 def to_run_frame(files: CaptureFiles, wanted: RegionSettings | None = None) -> Capture:
-    """Convert what was read of a capture to the run's frame. `wanted` is as for `read_capture`. Some masks are read."""
+    """Convert a capture that `read_files` has read to the run's frame. `wanted` is as for `read_capture`. Some masks are read."""
     folder, layout, points = files.folder, files.layout, files.points
     views, silhouettes, white = _silhouettes(files.views)
     up = up_direction(views)
@@ -185,12 +185,13 @@ def _check_cameras(folder: Path, views: list[View]) -> None:
 def _unique_names(views: list[View]) -> list[View]:
     """Make the cameras' names unique within each split ("train", "test").
 
-    If several photos have the same file name, their cameras' names get the folder's path in front. Raises InputError if that does not help.
+    If several photos have the same file name, the folder's path is put in front of their cameras' names. Raises InputError if names still
+    are not unique.
     """
     names = Counter((view.split, view.camera.name) for view in views)
     top = os.path.commonpath(
         [os.path.abspath(view.image_path.parent) for view in views]
-    )  # a file may name some absolutely
+    )  # absolute, because a camera file may give some photos by absolute paths
 
     def name(view: View) -> str:
         if names[view.split, view.camera.name] == 1:
@@ -263,6 +264,6 @@ def _digest(folder: Path, layout: str, views: list[View]) -> str:
             if path is not None:
                 digest.update(f" {Path(os.path.relpath(path, folder)).as_posix()} {path.stat().st_size}".encode())
         numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
-        # Rounded: the last bits differ between processors.
+        # Rounded, because the last bits differ between processors.
         digest.update((np.round([*numbers, *camera.world_to_camera.ravel()], 6) + 0.0).tobytes())
     return digest.hexdigest()

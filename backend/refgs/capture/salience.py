@@ -72,7 +72,10 @@ class SalienceModel:
 
 
 def _child(file: Path, pipe: Connection) -> None:
-    """Run a model: send the height and width of its input, then a map for each photo that comes; or an InputError."""
+    """Run a model in this process. Send the height and width of its input first, then a map for each photo that comes.
+
+    If the model or a photo does not work, send the InputError and end.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     try:
         session, size = _load(file)

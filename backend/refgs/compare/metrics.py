@@ -25,7 +25,7 @@ from refgs.compare.pictures import over_white
 from refgs.formats.panorama import directions
 from refgs.render.rendering import SOLID
 
-SPECK = 0.1  # encoded, from which on a pixel stands out of those about it
+SPECK = 0.1  # encoded difference from the pixels around it, from which on a pixel stands out
 LIGHT_BLUR = 3.0  # degrees, standard deviation
 LIGHTS_APART = 15.0  # degrees
 MOST_LIGHTS = 5

@@ -51,21 +51,21 @@ def whole_normal_mae_degrees(normals: np.ndarray, alpha: np.ndarray, true: np.nd
 
 
 def eroded(mask: np.ndarray) -> np.ndarray:
-    """Return where a mask holds after Stanford-ORB's erosion by a square of 5×5 pixels, bool (h, w)."""
+    """Return the mask after Stanford-ORB's erosion by a square of 5×5 pixels, as bool (h, w)."""
     return cv2.erode(np.rint(mask * 255).astype(np.uint8), np.ones((5, 5), np.uint8)) > 127
 
 
 def similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray, scaled: bool, lpips: bool) -> dict[str, float]:
     """Measure how alike a rendering and a photo are, as Stanford-ORB does. Both are linear radiance (h, w, 3). Returns by name:
 
-    - psnr_h: PSNR of radiance clipped at MOST_RADIANCE, after both were multiplied by one factor, the photo's mean sRGB-encoded divided by
-      its mean linear. The peak is 1 nevertheless.
+    - psnr_h: PSNR of radiance clipped at MOST_RADIANCE. Both are first multiplied by one factor: the mean of the sRGB-encoded photo
+      divided by the mean of the linear photo. The peak is 1 nevertheless.
     - psnr_l: PSNR of sRGB-encoded pictures, clipped to 0..1
     - ssim: of these, with a Gaussian window of 3×3 pixels and σ 1.5
     - lpips, if it is wanted: with VGG-16, of these sRGB-encoded once more. Stanford-ORB's program does so.
 
-    What lies outside the eroded mask is black in both, and counts. If `scaled`, each channel of the rendering is first multiplied by its
-    least-squares factor, as for pictures under another light. No PSNR is below that of a grey of 0.5.
+    Both pictures are black outside the eroded mask, and these pixels count. If `scaled`, each channel of the rendering is first multiplied
+    by its least-squares factor, as for pictures under another light. No PSNR is below that of a grey of 0.5.
     """
     inside = eroded(mask > 0.5)[..., None]
     image, photo = (np.where(inside, np.maximum(x, 0), 0).astype(np.float64) for x in (image, photo))
@@ -99,7 +99,7 @@ def _small_ssim(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def cosine_distance(normals: np.ndarray, true: np.ndarray, mask: np.ndarray) -> float:
-    """Compute Stanford-ORB's error of normals (h, w, 3): the mean of 1 − cosine over the eroded mask. Missing normals are zero: 1."""
+    """Compute Stanford-ORB's error of normals (h, w, 3): the mean of 1 − cosine over the eroded mask. A missing normal counts as 1."""
     seen = eroded(mask > 0.5)
     a, b = (x[seen] / (np.linalg.norm(x[seen], axis=-1, keepdims=True) + 1e-6) for x in (normals, true))
     return float((1 - (a * b).sum(-1)).mean(dtype=np.float64)) if seen.any() else 0.0

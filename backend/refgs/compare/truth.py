@@ -120,7 +120,7 @@ class GroundTruth:
 
 
 def check_size(file: Path, pixels: np.ndarray, camera: Camera) -> None:
-    """Raise InputError if a true picture is not as large as the camera's view, nor a larger one of the same shape."""
+    """Raise InputError if a true picture's size does not fit the camera's view: it must be as large, or larger and of the same shape."""
     (height, width), size = pixels.shape[:2], f"{camera.width}×{camera.height}"
     fitted = camera.resized(width, height).fitted(max(camera.width, camera.height))
     if (fitted.width, fitted.height) != (camera.width, camera.height):

@@ -1,4 +1,4 @@
-"""Read and write hints: which parts of a run's surface are metal or paint, as a user says (docs/run-folder.md)."""
+"""Read and write hints: the parts of a run's surface that a user says are metal or paint (docs/run-folder.md)."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ KINDS = get_args(Kind)
 
 
 class Hint(NamedTuple):
-    """Say of what `kind` a part of the surface is. `points` (P, 3) are the positions of its splats, in the run's frame."""
+    """Hold the `kind` of a part of the surface. `points` (P, 3) are the positions of its splats, in the run's frame."""
 
     kind: Kind
     points: np.ndarray

@@ -13,7 +13,7 @@ class _Figures(RootModel[dict[str, JsonValue]]):
 
 
 class Said(Model):
-    """Hold words for the user about what was measured, if there are any."""
+    """Hold a sentence for the user about a measurement, if there is one."""
 
     what: str | None = None
 
@@ -30,7 +30,7 @@ class Metrics(Model):
 
 
 def read_metrics(file: Path) -> tuple[dict[str, Any], Metrics]:
-    """Read a metrics.json as nested dicts, and what is known of it. Raises InputError naming the file and the value that is wrong."""
+    """Read a metrics.json as nested dicts, and as `Metrics`. Raises InputError naming the file and the value that is wrong."""
     again = "Remove it, and evaluate the run again."
     found = read_json(file, _Figures, again).root
     return found, validated(found, Metrics, str(file), again)

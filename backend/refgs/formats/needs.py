@@ -20,7 +20,7 @@ Inside = Annotated[str, AfterValidator(_inside)]
 
 
 class Pictures(Model):
-    """Name the pictures of both answers, files in the run folder, and the photo beside them. PSNRs are in dB."""
+    """Name the pictures with and without a part, which are files in the run folder, and the photo. PSNRs are in dB."""
 
     on: Inside
     off: Inside
@@ -34,8 +34,8 @@ class Found(Model):
     """Hold the decision about an optional part of a training, as checkpoints keep it.
 
     `statistic` was compared with `threshold`. Leaving the part out saves `seconds` and `megabytes`, and costs `decibels` of PSNR on the
-    training views. `side` and `total` are what `light` and `iterations` are reduced to. `again` is what the second look at a matte scene
-    found.
+    training views. `side` is the reduced resolution for the part `light`, `total` the reduced number of iterations for `iterations`.
+    `again` is the value that the second look at a matte scene measured.
     """
 
     needed: bool
@@ -52,7 +52,7 @@ class Found(Model):
 
 
 class Row(Model):
-    """Hold one part, `why` it was kept or left out, and in words what leaving it out saved and cost."""
+    """Hold one part of the training, `why` it was kept or left out, and in words what leaving it out saved and cost."""
 
     model_config = ConfigDict(extra="allow")  # the figures behind the words
 
@@ -66,7 +66,7 @@ class Row(Model):
     @field_validator("pictures", mode="wrap")
     @classmethod
     def _whole(cls, value: Any, handler: Any) -> Pictures | None:
-        """Leave out pictures that are not whole: a row is of use without them."""
+        """Leave out incomplete pictures, because a row is useful without them."""
         try:
             return handler(value)
         except ValidationError:

@@ -52,7 +52,7 @@ def parse_json(text: str, source: str, again: str) -> Any:
 
 
 def parse_toml(text: str, source: str, again: str) -> dict[str, Any]:
-    """Parse TOML as nested dicts. Raises InputError, which begins with the `source` and ends with `again`."""
+    """Parse TOML as nested dicts. Raises InputError, whose message begins with `source` and ends with `again`, the advice."""
     return _parsed(tomllib.loads, text, source, "TOML", again)
 
 

@@ -1,7 +1,7 @@
 """Tell where masks show an object's surface, by how long the rays at its outlines touch the visual hull.
 
-A ray through a photo's outline touches the object somewhere. Where it touches the hull only near one point, the surface is there. Where it
-runs along the hull, as over a bowl's lid or along a flat face, the surface may be anywhere below.
+A ray through a photo's outline touches the object somewhere. If it touches the hull only near one point, the surface is there. If it runs
+along the hull, as over a bowl's lid or along a flat face, the surface may be anywhere below.
 """
 
 from collections.abc import Sequence
@@ -19,9 +19,10 @@ ACROSS = 200  # pixels across the object, in the reduced masks
 
 
 def contact(shape: Shape, alphas: Sequence[np.ndarray], cameras: Sequence[Camera]) -> np.ndarray:
-    """Measure for each voxel half of the length for which a ray at an outline touches the shape there, the least of all rays.
+    """Measure how well outlines show the surface at each voxel. Returns (X, Y, Z) in world units; smaller is better.
 
-    Returns (X, Y, Z) in world units, infinite where no such ray passes.
+    The value is half of the length for which a ray at an outline touches the shape there. If several rays do, the least value counts. It is
+    infinite where no such ray passes.
     """
     centre, radius = shape.ball
     step = STEP * float(shape.voxel.min())

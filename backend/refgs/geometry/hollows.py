@@ -19,11 +19,11 @@ SMOOTH = 2  # cells: the votes of neighbours count, too
 
 
 def carve_hollows(alpha: np.ndarray, low: np.ndarray, voxel: np.ndarray, photos: Sequence[Photo]) -> np.ndarray:
-    """Carve what photos see through out of a visual hull. Returns how much of each voxel is left, (X, Y, Z) in 0..1.
+    """Remove the cells through which photos see from a visual hull. Returns which fraction of each voxel is left, (X, Y, Z) in 0..1.
 
     `alpha` (X, Y, Z) is at least one half in the hull. Its first voxel has the corner `low` (3,) and the size `voxel` (3,), in world units.
-    A cell of the hull is empty if enough photos see a surface behind it (see `stereo.depth_maps`), and few see one in it. Light must stand
-    still: under a light that turns with the camera, highlights are where a surface on the axis of the turntable would be.
+    A cell of the hull is empty if enough photos see a surface behind it (see `stereo.depth_maps`), and few see one in it. The light must
+    stand still. If it turns with the camera, highlights look like a surface on the axis of the turntable.
     """
     shape = Shape(alpha > 0.5, np.asarray(low), np.asarray(voxel))
     cells = Shape(shape.solid[::CELL, ::CELL, ::CELL], shape.low, CELL * shape.voxel)
@@ -38,7 +38,7 @@ def carve_hollows(alpha: np.ndarray, low: np.ndarray, voxel: np.ndarray, photos:
 
 
 def _empty(shape: Shape, maps: Sequence[DepthMap], least: float) -> np.ndarray:
-    """Tell which cells of a shape are empty, by the depth maps' votes: at least `least` of the photos must see through."""
+    """Tell which cells of a shape are empty. The depth maps vote: at least `least` of the photos must see through a cell."""
     cells = np.argwhere(shape.solid)
     points = shape.low + (cells + 0.5) * shape.voxel
     band = BAND * shape.ball[1]

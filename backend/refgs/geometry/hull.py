@@ -112,7 +112,7 @@ def visual_hull_points(
 
 
 def _as_bytes(alpha: np.ndarray) -> np.ndarray:
-    """Convert a mask of floats in 0..1 to uint8. One of uint8 is not copied: masks of many photos take gigabytes."""
+    """Convert a mask of floats in 0..1 to uint8. A uint8 mask is not copied, because masks of many photos take gigabytes."""
     alpha = np.asarray(alpha)
     return alpha if alpha.dtype == np.uint8 else np.rint(255 * alpha).astype(np.uint8)
 

@@ -1,7 +1,7 @@
-"""Find how far away an object's surface is in photos, by multi-view stereo: a plane sweep (Collins 1996) with normalised cross-correlation.
+"""Find the depth of an object's surface in photos by multi-view stereo: a plane sweep (Collins 1996) with normalised cross-correlation.
 
-Each photo is compared with its neighbours on planes at many depths. Where the neighbours, moved onto a plane, look like the photo, the
-surface is near that plane. Photos are reduced first, because this is only used to start a training.
+Each photo is compared with its neighbours on planes at many depths. If the neighbours, projected onto a plane, look like the photo, the
+surface is near that plane. Photos are reduced first, because depth is only used to start a training.
 """
 
 from collections.abc import Sequence
@@ -44,7 +44,10 @@ class Photo(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Shape that a surface must lie in: `solid` (X, Y, Z), bool. Its first voxel has the corner `low` (3,) and the size `voxel` (3,)."""
+    """Hold the shape in which a surface must lie.
+
+    `solid` (X, Y, Z), bool, marks its voxels. The first voxel has the corner `low` (3,) and the size `voxel` (3,).
+    """
 
     solid: np.ndarray
     low: np.ndarray
@@ -58,7 +61,7 @@ class Shape:
         return (first + last) / 2, float(np.linalg.norm(last - first)) / 2
 
     def fit(self, camera: Camera, across: int) -> Camera:
-        """Return the camera for its picture reduced so that the shape's ball is `across` pixels wide. Smaller ones are left as they are."""
+        """Return the camera of a picture reduced until the shape's ball is `across` pixels wide. Smaller pictures stay as they are."""
         centre, radius = self.ball
         distance = float(np.linalg.norm(camera.position - centre))
         side = across * max(camera.width, camera.height) * distance / (2 * radius * camera.fx)
@@ -73,7 +76,7 @@ class Shape:
 
 
 class DepthMap(NamedTuple):
-    """Hold a view's `depth` (h, w), along the camera's axis, and how much it counts: `weight` (h, w) in 0..1, 0 where it is unknown."""
+    """Hold a view's `depth` (h, w), along the camera's axis, and its `weight` (h, w) in 0..1, which is 0 where depth is unknown."""
 
     camera: Camera
     depth: np.ndarray
@@ -99,11 +102,11 @@ class _Reduced(NamedTuple):
 def depth_maps(photos: Sequence[Photo], shape: Shape, unsure: np.ndarray) -> list[DepthMap]:
     """Estimate the depth of an object's surface in photos. The surface is looked for in `shape`, such as the masks' visual hull.
 
-    Only pixels count whose rays enter the shape in a voxel of `unsure` (X, Y, Z), bool: elsewhere the surface is known to be there.
+    Only pixels whose rays enter the shape in a voxel of `unsure` (X, Y, Z), bool, count. In other voxels, the surface is known already.
 
-    Returns a map for each photo that has at least BEST neighbours. Depth is known where a photo has texture that its neighbours show in the
-    same place, and where AGREE of their own maps agree. A mirror shows images of other things behind its surface; what is mirrored in a
-    curved one seldom agrees, but what is mirrored in a flat one does.
+    Returns a map for each photo that has at least BEST neighbours. Depth is known where the neighbours show the photo's texture in the same
+    place, and where AGREE of their own maps agree. A mirror shows images of other things behind its surface. Such images seldom agree in a
+    curved mirror, but they do in a flat one.
     """
     centre, radius = shape.ball
     reduced = [_reduced(photo, shape) for photo in photos]
@@ -126,7 +129,7 @@ def _reduced(photo: Photo, shape: Shape) -> _Reduced:
 
 
 def _neighbours(cameras: list[Camera], centre: np.ndarray) -> list[np.ndarray]:
-    """Choose for each camera the NEIGHBOURS nearest ones of those that see the object from an angle within ANGLES away."""
+    """Choose the NEIGHBOURS nearest cameras for each camera, among those that see the object from an angle within ANGLES away."""
     towards = np.stack([camera.position for camera in cameras]) - centre
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     angle = np.degrees(np.arccos((towards @ towards.T).clip(-1, 1)))
@@ -135,7 +138,7 @@ def _neighbours(cameras: list[Camera], centre: np.ndarray) -> list[np.ndarray]:
 
 
 def _sweep(photo: _Reduced, others: list[_Reduced], shape: Shape, unsure: np.ndarray) -> DepthMap:
-    """Find the depth at which a photo looks most like the others, in each pixel, of the planes that lie in the shape there."""
+    """Find the depth in each pixel at which a photo looks most like the others. Only planes that lie in the shape there are tried."""
     camera, (centre, radius) = photo.camera, shape.ball
     middle = float(camera.world_to_camera[2, :3] @ centre + camera.world_to_camera[2, 3])
     planes = 1 / np.linspace(1 / max(middle - radius, radius / 100), 1 / (middle + radius), PLANES)
@@ -160,7 +163,7 @@ def _sweep(photo: _Reduced, others: list[_Reduced], shape: Shape, unsure: np.nda
 
 
 def _entry(camera: Camera, rays: np.ndarray, planes: np.ndarray, within: np.ndarray, shape: Shape) -> np.ndarray:
-    """Return the points (N, 3) where rays enter a shape. `within` (P, N) tells which of their points on P planes lie in it."""
+    """Return the points (N, 3) at which rays enter a shape. `within` (P, N) tells which of the rays' points on P planes lie in it."""
     first = within.argmax(axis=0)
     before, after = planes[np.maximum(first - 1, 0)], planes[first]
     for _ in range(BISECTIONS):
@@ -175,7 +178,7 @@ def _scores(
 ) -> np.ndarray:
     """Compare a photo with the others, moved onto planes that face its camera.
 
-    Returns the mean correlation (P, N) with the BEST best of them, in each of N pixels on each of P planes.
+    Returns the mean correlation (P, N) with the BEST most similar photos, in each of N pixels on each of P planes.
     """
 
     def mean(picture: np.ndarray) -> np.ndarray:
@@ -213,7 +216,7 @@ def _intrinsics(camera: Camera) -> np.ndarray:
 
 
 def _agreed(i: int, near: list[np.ndarray], maps: dict[int, DepthMap], tolerance: float) -> DepthMap:
-    """Return the map of photo `i` without the depths on which fewer than AGREE of its neighbours' maps agree."""
+    """Return the depth map of photo `i`. Drop the depths on which fewer than AGREE of its neighbours' maps agree."""
     camera, depth, weight = maps[i]
     rows, columns = np.nonzero(weight)
     points = camera.position + pixel_rays(camera, rows, columns) * depth[rows, columns, None]

@@ -31,7 +31,7 @@ FLAGS += ["-fno-builtin", "-ffp-contract=on", "-fno-math-errno", "-mprefer-vecto
 
 @dataclass(frozen=True)
 class Target:
-    """Say what a library is compiled for: platform and processor, by Zig's names for them, and the library's file extension."""
+    """Describe what a library is compiled for: platform and processor, by Zig's names, and the library's file extension."""
 
     platform: str
     processor: str

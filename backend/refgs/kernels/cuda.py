@@ -61,7 +61,7 @@ def unusable() -> str | None:
 
 
 class CardError(RuntimeError):
-    """Error of a CUDA card that cannot go on: it was lost, or what it ran went wrong."""
+    """Report that a CUDA card can no longer be used: it was lost, or a kernel failed on it."""
 
 
 def _check(result: tuple, what: str) -> Any:

@@ -11,16 +11,16 @@ from refgs.clock import timed
 from refgs.kernels.layout import struct
 from refgs.kernels.load import run
 
-LOGIT = 12.0  # beyond, float32 cannot tell a logistic function from its limit, and its slope is of no use
+LOGIT = 12.0  # beyond, a logistic function is within 1e-5 of its limit, and its slope is too small to learn by
 LIMITS = {
     "opacity": (-LOGIT, LOGIT),
     "albedo": (-LOGIT, LOGIT),
     "roughness": (-LOGIT, LOGIT),
-    "metallic": (-LOGIT / 2, LOGIT / 2),  # activated by a function that nears its limits as the square
-    "exposure": (-LOGIT, LOGIT),  # natural logarithms: 17 stops
+    "metallic": (-LOGIT / 2, LOGIT / 2),  # its activation approaches its limits as the square of a logistic function
+    "exposure": (-LOGIT, LOGIT),  # natural logarithm of a factor: 12 is 17 stops
 }
-DARKEST = -LOGIT  # raw light: below, softplus' slope, which is the radiance itself, is of no use
-SMALLEST, LARGEST = 1e-6, 1e2  # of a surfel, in scene radii
+DARKEST = -LOGIT  # raw light; below, softplus' slope, about the radiance itself, is too small to learn by
+SMALLEST, LARGEST = 1e-6, 1e2  # a surfel's scale, in scene radii
 
 _Tensor = struct("Learned", "adam.cpp")
 _Work = struct("Adam", "adam.cpp")
@@ -38,8 +38,9 @@ class Moments:
 class Learned(Mapping[str, Tensor]):
     """Hold the tensors that a training learns, by name, with Adam's moments, learning rates and limits.
 
-    A tensor is by row if it has a row for each surfel. Those rows are replaced together. A tensor by row that gets no gradient, such as a
-    mask, only follows. `constant` has the tensors that do not learn any more: one row for all surfels.
+    A tensor is by row if it has one row for each surfel. The rows of all such tensors are replaced together (see `rows`). A tensor by row
+    that gets no gradient, such as a mask, is replaced with them, but Adam does not change it. `constant` holds the tensors that no longer
+    learn, each with one row for all surfels.
 
     One kernel updates all tensors with Adam (Kingma and Ba 2015). Elements whose gradient is zero keep their value and their moments. So a
     surfel that is not visible does not move. In the original Adam it would still move, because its moments decay slowly.
@@ -48,9 +49,9 @@ class Learned(Mapping[str, Tensor]):
     BETAS, EPSILON = (0.9, 0.999), 1e-15
 
     def __init__(self, radius: float = 1.0, brightest: float = math.inf) -> None:
-        """Start without tensors. `radius` is the scene's, and `brightest` the highest raw value of the light's texels: see `limits`."""
+        """Start without tensors. `radius` is the scene's, and `brightest` the highest raw value of the light's texels (see `limits`)."""
         self.rates: dict[str, float] = {}
-        self.moments: dict[str, Moments] = {}  # of those that had a gradient
+        self.moments: dict[str, Moments] = {}  # of the tensors that Adam has updated
         self.constant: dict[str, Tensor] = {}
         self._radius, self._brightest = radius, brightest
         self._values: dict[str, Tensor] = {}
@@ -87,7 +88,10 @@ class Learned(Mapping[str, Tensor]):
         return LIMITS.get(name, (-math.inf, math.inf))
 
     def learn(self, name: str, value: Tensor, by_row: bool = True) -> None:
-        """Learn a tensor, from the values in `value`, without moments. A tensor of this name is replaced, and keeps its rate."""
+        """Start to learn a tensor from the values in `value`, without moments.
+
+        A tensor that has this name already is replaced. Its learning rate stays.
+        """
         self._values[name] = _leaf(value)
         self.moments.pop(name, None)
         self.constant.pop(name, None)
@@ -110,9 +114,9 @@ class Learned(Mapping[str, Tensor]):
 
     @torch.no_grad()
     def rows(self, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
-        """Replace all surfels by the rows `index` of their tensors. A row may be taken more than once.
+        """Rebuild all surfels from the rows `index` of their tensors. A row may be taken more than once.
 
-        Each row keeps its moments. Only the rows whose indices in the result are in `fresh` start with zero moments. Adam then moves these
+        Each row keeps its moments, except that rows of the result with an index in `fresh` start with zero moments. Adam then moves these
         rows faster than others at first. Pictures get worse for a while, but for captures without masks, the final result is better. If
         memory runs out, all surfels stay as they were.
         """
@@ -135,12 +139,12 @@ class Learned(Mapping[str, Tensor]):
 
     @torch.no_grad()
     def fill(self, name: str, value: Tensor | float) -> None:
-        """Set a tensor to a value, or to values for all or each of its rows. Forget its moments."""
+        """Set a tensor to a number, or to a tensor that broadcasts to it. Forget its moments."""
         self._values[name][:] = value
         self.forget(name)
 
     def forget(self, name: str, which: Tensor | None = None) -> None:
-        """Set the moments of a tensor to zero where `which` (N,) is true. Without it, Adam starts anew with the tensor."""
+        """Set the moments of a tensor to zero in the rows where `which` (N,) is true. Without `which`, Adam starts anew with the tensor."""
         if which is None:
             self.moments.pop(name, None)
         elif old := self.moments.get(name):
@@ -199,10 +203,11 @@ class Learned(Mapping[str, Tensor]):
         return tensors
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over the tensors of a checkpoint that are learned here, and those that are constant here.
+        """Take over a checkpoint's values of the tensors that are learned or constant here.
 
-        Tensors of only one row there and learned here, or the other way round, are expanded or shortened: they were left out, or brought
-        back, after this checkpoint. Those that are not by row and not there are dropped. Raises KeyError if another one is missing.
+        A parameter may have been left out, or brought back, after the checkpoint was written. If it is constant there and learned here, its
+        one row is repeated for all surfels. If it is learned there and constant here, its first row is taken. A learned tensor that is not
+        by row is dropped if the checkpoint lacks it. Raises KeyError if any other tensor is missing.
         """
         rows = len(tensors["parameter.position"])
         self.moments.clear()
@@ -228,7 +233,7 @@ class Learned(Mapping[str, Tensor]):
 
 
 def belong_together(tensors: Mapping[str, Tensor]) -> bool:
-    """Tell whether the tensors of a checkpoint are complete, and have the rows and types that belong together."""
+    """Tell whether the tensors of a checkpoint are complete, and whether their shapes and types match."""
     fine = {"environment", "parameter.position"} <= tensors.keys()
     rows = tensors["parameter.position"].shape[:1] if fine else ()
     for name, value in tensors.items():

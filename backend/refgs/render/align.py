@@ -1,9 +1,9 @@
 """Find the pose of a camera that makes a rendering fit its photo, by Gauss-Newton steps on the pixels' colours.
 
-A pose is six numbers (6,): a rotation vector about the scene's centre, in radians, and a translation in scene radii. It moves the scene,
-not the camera; it is the identity at zero. If the scene moves a little, the picture moves with the surface that each pixel shows: from its
-depth follows by how many pixels (Baker and Matthews 2004, Engel et al. 2018). Colours are taken to move along. Mirror images do not quite,
-but on a curved surface they move mostly with it.
+A pose is six numbers (6,): a rotation vector around the scene's centre, in radians, and a translation in scene radii. It moves the scene,
+not the camera. The pose zero is the identity. If the scene moves a little, each pixel moves with the surface that it shows, by an amount
+that follows from its depth (Baker and Matthews 2004, Engel et al. 2018). Colours are assumed to move with the surface. This is not quite
+true of mirror images, but on a curved surface they mostly do.
 """
 
 from collections.abc import Callable
@@ -39,9 +39,9 @@ def pose_step(
 ) -> Tensor:
     """Compute the pose (6,) that moves the rendering of `camera` towards the photo (H, W, 3), sRGB-encoded. Zero if nothing is shown.
 
-    It minimises Σ w |photo − picture + ∇picture · motion(pose)|² over the pixels and channels. ∇ takes central differences; it is the mean
-    of the picture's and the photo's, which converges faster (Benhimane and Malis 2004). w falls where the two differ much.
-    Pictures are first made smaller by the factor `reduction`, so that larger motions are found.
+    It minimises Σ w |photo − picture + ∇picture · motion(pose)|² over the pixels and channels. ∇ takes central differences. It is the mean
+    of the picture's and the photo's gradients, which converges faster (Benhimane and Malis 2004). The weight w is small where the two
+    differ much.
     """
     maps = [rendering.color.clamp(0, 1), photo, rendering.blended_depth[..., None], rendering.alpha[..., None]]
     color, photo, depths, alpha = (_reduced(value, reduction) for value in maps)
@@ -70,7 +70,7 @@ def _normal_equations(
 ) -> tuple[Tensor, Tensor]:
     """Sum the normal equations of a pose (6, 6) and (6,), float64, over the pixels at these rows and columns.
 
-    `maps` are the slopes of the picture across and down (H, W, 3), how far the photo is apart (H, W, 3), and the depth (H, W).
+    `maps` are the gradients of the picture to the right and down (H, W, 3), the differences from the photo (H, W, 3), and the depth (H, W).
     """
     across, down, apart, depth = (value[rows, columns].double() for value in maps)
     x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy

@@ -6,7 +6,7 @@ from typing import Any, Literal
 from refgs.settings import Settings
 
 By = Literal["plan", "photos", "needs", "memory"]
-"""What changes a setting: a time given to the training, the photos, a need that the scene does without, a card's full memory."""
+"""Causes of a change: a time limit, the photos, a need that the scene does without, a graphics card whose memory is full."""
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,11 @@ from refgs.train.learn import coarse
 from refgs.train.plan import BY_PIXELS, END, END_A_VIEW, FULL, OTHERS, Plan, growth, iterations_time
 from refgs.train.trainer import Trainer
 
-WARM, REHEARSED = 5, 25  # iterations: the pace is that from the first to the second
-SCHEDULE = ("train", "light_first"), ("densify", "every"), ("indirect", "every")  # scaled with the iterations
-FASTEST = 2.0  # times a preset's rates
-RICHER_STEPS, RICHEST = 64, 2.0  # steps in which settings richer than quick are tried, and how far: standard is at one
+WARM, REHEARSED = 5, 25  # iterations between which the pace is measured
+# Settings that are scaled with the number of iterations.
+SCHEDULE = ("train", "light_first"), ("densify", "every"), ("indirect", "every")
+FASTEST = 2.0  # largest factor on a preset's learning rates
+RICHER_STEPS, RICHEST = 64, 2.0  # number of steps from `quick` (0) to the richest settings; `standard` is at 1
 
 
 def fitting(
@@ -35,23 +36,23 @@ def fitting(
     started = plan.spent
     marks = []
     for _ in range(REHEARSED):
-        float(trainer.iterate()["loss"])  # waits for a card
+        float(trainer.iterate()["loss"])  # reading the loss waits for the graphics card
         marks.append(plan.spent)
     pace = (
         (marks[-1] - marks[WARM - 1]) / (REHEARSED - WARM) / trainer.state.part(coarse.Coarse).stages[0].cost
-    )  # on full photos
+    )  # in iterations on full photos
     views, first = len(capture.train_views) + len(capture.test_views), trainer.state.learned.count
     pixels, size = _pixels(capture, quick), object_size(trainer.state)
 
     def iterations(settings: Settings) -> float:
         """Estimate how many iterations with these settings fit into the time that is left."""
         larger = _pixels(capture, settings) / pixels
-        # There may be fewer points to start from than the settings ask for.
+        # Fewer points may be known to start from than the settings ask for.
         start = settings.surfels.start if first == quick.surfels.start else first
         one = pace * (OTHERS + start) / (OTHERS + first) * larger**BY_PIXELS
         left = 60 * (plan.minutes or 0.0) - plan.spent
         if settings is not quick:
-            left -= (started - begun) * larger  # for another start
+            left -= (started - begun) * larger  # richer settings need a second start
         more = growth(start, surfel_budget(settings.surfels, size.area * larger))
         stages = FULL if settings.image.coarse == "off" else coarse.stages(size.span * larger**0.5)
         return (left / one - more * (END_A_VIEW * views + END)) / iterations_time(more, 1.0, stages)
@@ -73,7 +74,7 @@ def fitting(
         state.effective = state.effective.moved_to(settings, "plan", why)
         state.total = settings.train.iterations
     else:
-        del trainer  # first, for its memory
+        del trainer  # free its memory first
         settings = _scheduled(found, count, quick, standard)
         trainer = Trainer(capture, effective.moved_to(settings, "plan", why), folder, report, plan, device)
     settings = trainer.state.settings

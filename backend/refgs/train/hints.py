@@ -1,7 +1,7 @@
 """Continue a finished training with hints: parts of the surface that a user says are metal or paint.
 
-Photos of a mirror can often be explained twice: a chrome egg at night mirrors darkness, and looks like black plastic. Training stays with
-the explanation that it found first, even if the other one is better: on the way there, pictures are worse.
+Photos of a mirror often have two explanations. A chrome egg at night mirrors darkness, and looks like black plastic. Training stays with
+the explanation that it found first, even if the other one is better, because pictures get worse on the way from one to the other.
 """
 
 from pathlib import Path
@@ -21,19 +21,21 @@ from refgs.train.material import metals
 from refgs.train.start import start_appearance
 from refgs.train.state import State
 
-AGAIN = 0.4  # part of the training from which it is repeated: surfels lie on the surface, light and materials still learn fast
-AT_MOST = 1.8  # minutes, unless another time is asked for: an artist who clicks on a part waits, two minutes with the start of the program
-# Hinted metals start as what is hard to tell from paint: bright and smooth.
+# Progress at which training starts again: surfels lie on the surface, and light and materials still learn fast.
+AGAIN = 0.4
+# Minutes, unless the user gives a time: an artist who clicks on a part waits two minutes, with the program's start.
+AT_MOST = 1.8
+# Hinted metals start bright and smooth: photos tell this kind of metal from paint least.
 MIRROR = {"albedo": 0.8, "roughness": 0.1}
 
 
 def continue_with_hints(state: State, run: Path, hints: list[Hint]) -> None:
-    """Take over what a finished `run` has learned, and go back in the training, with the hinted parts' materials held.
+    """Take over what a finished `run` has learned, return to an earlier iteration, and hold the materials of the hinted parts.
 
-    Hinted metals start as a bright mirror, for the base colour that they had as plastic tells nothing. Hinted paint keeps its base colour
-    and roughness, as rough metal looks much like paint of its colour. The residual of all surfels starts again.
+    Hinted metals start as a bright mirror, because the base colour that they had as plastic tells nothing. Hinted paint keeps its base
+    colour and roughness, because rough metal looks much like paint of its colour. The residual of all surfels starts anew.
 
-    Raises InputError if the run has no checkpoint, or if it was told not to learn metals.
+    Raises InputError if the run has no checkpoint, or if its settings leave out metals.
     """
     snapshot.restore(state, run)
     if "metallic" not in state.learned and not needs.bring_back_specular(state, "hints say what is metal"):
@@ -54,8 +56,8 @@ def continue_with_hints(state: State, run: Path, hints: list[Hint]) -> None:
 def hinted_kinds(state: State, splats: np.ndarray, hints: list[Hint]) -> torch.Tensor:
     """Return for each surfel (N,) the index of its hinted kind in `KINDS`, −1 without a hint.
 
-    `splats` (M, 3) are the positions of the run's splats. Each point of a hint means the nearest splat. A surfel is as the splat nearest to
-    it: surfels that no photo shows have no row in splats.ply. The last hint about a splat counts.
+    `splats` (M, 3) are the positions of the run's splats. Each point of a hint belongs to the nearest splat. If several hints name a splat,
+    the last one counts. A surfel takes the kind of the nearest splat, because surfels that no photo shows have no row in splats.ply.
     """
     tree, kinds = cKDTree(splats), np.full(len(splats), -1)
     for hint in hints:
@@ -65,9 +67,10 @@ def hinted_kinds(state: State, splats: np.ndarray, hints: list[Hint]) -> torch.T
 
 
 def _go_back(state: State) -> None:
-    """Set the iteration back to AGAIN of the training, or to where the rest takes the time that is given. Start its clocks anew.
+    """Set the iteration to the fraction AGAIN of the total, and start the clocks anew.
 
-    If no time is given and the rest would take longer than AT_MOST, that is the time.
+    With a time limit, the total is chosen so that the remaining iterations fill the time that is left. Without one, AT_MOST becomes the
+    limit if the remaining iterations would take longer.
     """
     count, pace, plan = (1 - AGAIN) * state.total, state.seconds / max(state.iteration, 1), state.plan
     state.seconds = plan.before = 0.0
@@ -83,9 +86,10 @@ def _go_back(state: State) -> None:
 
 @torch.no_grad()
 def _restart(state: State, names: tuple[str, ...], which: torch.Tensor, settings: Settings) -> None:
-    """Give some surfels, those that are true in `which` (N,), the values of parameters with which surfels start by these settings."""
+    """Reset parameters of the surfels where `which` (N,) is true to the values with which surfels start under `settings`."""
     start = start_appearance(settings)
     for name in {*names} & state.learned.keys():
         value, row = state.learned[name], start[name][0]
-        value[which] = (row[: value.shape[1]] if row.ndim == 2 else row).to(value)  # degrees may be left out
+        # The tensor may lack higher degrees of harmonics.
+        value[which] = (row[: value.shape[1]] if row.ndim == 2 else row).to(value)
         state.learned.forget(name, which)

@@ -9,7 +9,8 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.capture import LoadedView
 
-MARGIN = 10  # pixels about the mask: no D-SSIM window, whose radius is 5, then sees both the object and the border
+# Pixels around the mask; no D-SSIM window, whose radius is 5, then covers both the object and the crop's border.
+MARGIN = 10
 
 Crop = tuple[slice, slice]
 """Rows and columns of a photo."""

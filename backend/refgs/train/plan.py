@@ -3,17 +3,18 @@
 import time
 from typing import NamedTuple
 
-# Time that writing the asset takes, in iterations: for each photo, for all of them are rendered, and besides.
+# Time for writing the asset, in iterations: a time for each photo, because all are rendered, and a constant.
 END_A_VIEW, END = 0.5, 20
-# Iterations grow slower as surfels are divided and inter-reflection joins: linearly between these parts of a training.
+# Iterations slow down as surfels are divided and inter-reflection starts. The slowdown is linear between these parts of a training.
 GROWS = 0.1, 0.3
-OTHERS = 16_000  # surfels that take as long as the rest of an iteration
-BY_PIXELS = 0.8  # an iteration's time grows as the photos' pixels do, to this power: 0.7 to 0.9 on three captures
-MIRRORED = 1.2  # factor of an iteration's time for inter-reflection: 1 without, 1.4 where much mirrors itself
+OTHERS = 16_000  # number of surfels that takes as long as the rest of an iteration
+BY_PIXELS = 0.8  # an iteration's time grows with the number of pixels to this power: 0.7 to 0.9 on three captures
+# Factor on an iteration's time for inter-reflection: 1 without, 1.4 if much of the object mirrors itself.
+MIRRORED = 1.2
 
 
 class Stage(NamedTuple):
-    """Describe a stage of a training: `until` which part of it, and by what `factor` photos are reduced (see `train/coarse.py`)."""
+    """Describe a stage of a training: it lasts up to the progress `until`, on photos reduced by `factor` (see `learn/coarse.py`)."""
 
     until: float
     factor: int

@@ -24,13 +24,13 @@ from refgs.train.learn.losses import objective
 from refgs.train.photo import Photo
 from refgs.train.state import RenderInputs, State, spread
 
-VIEWS = 8  # that are looked at, at the most
-SEVERAL = 12  # where a surfel has to be seen from several sides
-PART = 0.01  # part of the object's pixels that counts by itself: a chrome bell may be no larger
-REPEATS = 2  # iterations that are timed with and without; the fastest of each counts
+VIEWS = 8  # views that are looked at, at most
+SEVERAL = 12  # views, at most, where a surfel must be seen from several sides
+PART = 0.01  # fraction of the object's pixels that is judged by itself: a chrome bell may be no larger
+REPEATS = 2  # times that each kind of iteration is measured; the fastest counts
 
 Change = Callable[[RenderInputs], RenderInputs]
-"""What is done without."""
+"""Function that leaves a part out of the inputs of a rendering."""
 
 
 def pooled(environment: Environment, side: int) -> Environment:
@@ -53,8 +53,8 @@ def picture(state: State, view: int, inputs: RenderInputs, whole: bool = False) 
 class Lost(NamedTuple):
     """Hold how many dB of PSNR the training views lose by a change of what is rendered.
 
-    `whole` is of all of the object's pixels. `part` is of a hundredth of them (PART), where the pictures change most: a small part of the
-    object may need what the rest of it does not.
+    `whole` is the loss over all of the object's pixels. `part` is the loss over the hundredth of them (PART) in which the pictures change
+    most: a small part of the object may need what the rest of it does not.
     """
 
     whole: float
@@ -67,10 +67,11 @@ def decibels_lost(errors: Tensor, without: Tensor) -> float:
 
 
 def lost(views: Iterable[tuple[Tensor, Tensor, Tensor]]) -> Lost:
-    """Compute what is lost between two pictures of each view: (picture, changed picture, photo), each (P, 3), encoded pixels of the object.
+    """Compute how much worse the second of two pictures of each view is.
 
-    The pixels of `Lost.part` are chosen by how far the two pictures are apart, whichever of them is nearer to the photo: so chance favours
-    neither. `views` may be a generator: only three numbers a pixel are kept.
+    Each of `views` is (picture, changed picture, photo), all encoded pixels (P, 3) of the object. The pixels of `Lost.part` are those in
+    which the two pictures differ most, whichever of them is nearer to the photo, so that chance favours neither. `views` may be a
+    generator: only three numbers per pixel are kept.
     """
     rows = []
     for picture, other, truth in views:

@@ -85,8 +85,8 @@ def _choose_light_frame(state: State, start: Parameters, on_hull: int) -> None:
 def _start_learning(state: State, start: Parameters) -> None:
     """Start learning the surfels, the light and the photos' exposures.
 
-    Surfels start with the parameters `start`. Those that do not affect this run's pictures, and those that the rendering method fixes, are
-    constant.
+    Surfels start with the parameters `start`. Parameters that do not affect this run's pictures are constant, and so are those that the
+    rendering method fixes.
     """
     settings, method = state.settings, state.method
     state.learned = Learned(state.capture.radius, method.light.brightest)
@@ -118,7 +118,7 @@ def _unused(state: State) -> list[str]:
 
 
 def start_residual(state: State, step: Step) -> None:
-    """Let the residual learn: the colour by direction that material and light do not explain."""
+    """Let the residual learn. It is a colour that changes with the direction, and explains what material and light do not."""
     state.residual = True
 
 
@@ -133,6 +133,6 @@ def start_deferred(state: State, step: Step) -> None:
         if name in state.learned:
             state.learned.fill(name, row)
     state.learned.fill("environment", light.start_value(state))
-    if "exposure" in state.learned:  # learned against the light before
+    if "exposure" in state.learned:  # exposures were learned with the earlier light
         state.learned.fill("exposure", 0.0)
     state.report("stage", {"what": "shading what is blended: colour, material and light start anew"})

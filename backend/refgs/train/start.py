@@ -16,8 +16,8 @@ from refgs.render.baselines import axes_of
 from refgs.settings import Settings, SurfelSettings
 
 GEOMETRY = ("position", "rotation", "scale", "opacity")
-FAINT = 0.1  # opacity at the most, of points that may not lie on the surface
-AROUND = 0.5  # part of the surfels, at the most, that lie outside the region
+FAINT = 0.1  # largest opacity of points that may not lie on the surface
+AROUND = 0.5  # largest fraction of the surfels that may lie outside the region
 
 
 def start_parameters(
@@ -94,7 +94,7 @@ def _hull_points(capture: Capture, views: list[LoadedView], count: int, settings
     around = within(capture.reach)
     try:
         near = within(capture.radius)
-    except InputError:  # they have an object beyond the box
+    except InputError:  # masks show an object, but only outside the box
         raise InputError("nothing that the masks show lies in the region: move its box, or enlarge it") from None
     chosen = _in_and_around(capture.box, near[0], around[0], count, seed)
     positions, normals, _, on_it = (

@@ -51,8 +51,8 @@ class RenderInputs(NamedTuple):
 class State:
     """Hold the state of a training: the capture, what it learns, and the decisions that it has made.
 
-    The constructor only reads the photos; `train/setup.py` makes the surfels, and `train/trainer.py` trains them. What only one part of the
-    training needs to remember is in that part's own memory, `part(Kind)`.
+    The constructor only reads the photos; `train/setup.py` makes the surfels, and `train/trainer.py` trains them. A fact that only one part
+    of the training needs is in that part's own memory, `part(Kind)`.
     """
 
     def __init__(
@@ -66,13 +66,13 @@ class State:
             views = [*capture.train_views, *capture.test_views]
             loaded = load_views(views, self.settings.image.max_side, folder / PHOTOS)
             self.views, self.test = loaded[: len(capture.train_views)], loaded[len(capture.train_views) :]
-        self.photos: list[Photo] = []  # of the views
+        self.photos: list[Photo] = []  # photos of `views`
         self.crops: list[Crop] | None = None  # the parts of the photos that are trained on; None: all of them
         self.iteration, self.total = 0, self.settings.train.iterations
         self.seconds = 0.0
         self.decided: dict[str, str] = {}  # lines for the artist, by what was decided
         self.needs: dict[str, Found] = {}  # the decisions of `train/decide`, by the need's name
-        self.initial = self.method.deferred and self.settings.initial.until > 0  # its stage is not over
+        self.initial = self.method.deferred and self.settings.initial.until > 0  # the initial stage is not over yet
         self.residual = False  # the residual learns (see `residual_start`)
         self.learned = Learned()  # surfels, "environment" (raw texels of the light), and "exposure" (one row a view)
         self.occluder: Occluder | None = None
@@ -88,12 +88,12 @@ class State:
 
     @property
     def near(self) -> float:
-        """Return how near to a camera surfels are drawn."""
+        """Return the distance from a camera within which surfels are not drawn."""
         return near_plane(self.capture.radius)
 
     @property
     def from_hull(self) -> bool:
-        """Tell whether surfels start on the masks' hull: all photos have masks."""
+        """Tell whether surfels start on the visual hull of the masks. They do if all photos have masks."""
         return all(view.alpha is not None for view in self.views)
 
     @property
@@ -204,8 +204,8 @@ def why_not_traced(state: State) -> str:
         return state.needs["reflections"].why
     if settings.render.reflection == "none":
         return "nothing is mirrored"
-    if not state.from_hull:  # the mesh would be of the surroundings too
+    if not state.from_hull:  # the mesh would include the surroundings
         return "not every photo has a mask of the object"
-    if settings.light.frame == "camera":  # surfels have no light of their own to show others
+    if settings.light.frame == "camera":  # surfels have no fixed radiance that others could mirror
         return "the light turns with the camera: what the object mirrors of itself changes from photo to photo"
     return ""

@@ -1,9 +1,9 @@
-"""Tell when each thing is done in a training: one row for each.
+"""Tell when each thing is done in a training. Each has one row.
 
-`Trainer.step` walks BEFORE, renders a photo and takes a step of Adam, and then walks AFTER. `scripts/timeline_page.py` prints all rows into
-docs/timeline.md. No other module of the training compares its progress with anything.
+`Trainer.step` does what is due in BEFORE, renders a photo and takes a step of Adam, and then does what is due in AFTER.
+`scripts/timeline_page.py` prints all rows into docs/timeline.md. No other module of the training compares its progress with anything.
 
-A training's progress is the part of its iterations that are done, 0..1.
+A training's progress is the fraction of its iterations that are done, 0..1.
 """
 
 import math
@@ -17,25 +17,26 @@ from refgs.train.plan import Stage
 from refgs.train.start import GEOMETRY
 from refgs.train.state import State, why_not_traced
 
-RESET = 0.01  # opacity
-SEEN = 0.2  # opacity from which on surfels explain a picture: nothing is decided, and no mesh is made, of fainter ones
+RESET = 0.01  # opacity to which a reset lowers all surfels
+# Surfels explain a picture from this opacity on: while they are fainter, nothing is decided, and no mesh is made.
+SEEN = 0.2
 POSES_FROM, POSES_KNOWN, POSES_UNTIL = (
     0.05,
     0.3,
     2 / 3,
 )  # parts of the training: poses start to learn, are judged, and are frozen
-WHOLE_EVERY = 8  # iterations: one of these sees its whole photo, so that nothing stays beyond the margin of a crop
+WHOLE_EVERY = 8  # one in this many iterations sees its whole photo, so that nothing stays beyond the margin of a crop
 REFLECTING = ("albedo", "metallic", "roughness", "indirect_dc", "indirect_rest", "environment", "exposure")
 PHOTO_STAGES = (0.35, 4), (0.7, 2)  # part of the training until which photos are reduced, and by what factor
-FIRST_LINE, A_DECADE = 10, 10  # of the history: iterations before it, and lines while iterations grow tenfold
+FIRST_LINE, A_DECADE = 10, 10  # first iteration with a line in the history, and lines for each tenfold of iterations
 
 
 class Step:
-    """Hold one iteration while it is done.
+    """Hold the facts of the iteration that is being done.
 
-    `progress` is the training's when the iteration begins. `done` counts iterations: those before this one, and from Adam's step on this
-    one, too. `view` is the training view. `hidden` is the part of the object's pixels that mirror the object, if this iteration has made
-    a mesh, else None. The `photo` and its `rendering` are known from Adam's step on.
+    `progress` is that of the training when the iteration begins. `done` counts finished iterations, and includes this one from Adam's step
+    on. `view` is the training view. `hidden` is the fraction of the object's pixels that mirror the object if this iteration has made a
+    mesh, else None. `photo` and `rendering` are set from Adam's step on.
     """
 
     photo: Photo
@@ -51,7 +52,7 @@ Test = Callable[[State, Step], bool]
 
 
 class When(NamedTuple):
-    """Hold a time of the training, or a condition: words for the page, and whether it has come, or holds."""
+    """Hold a time of the training, or a condition. `holds` tells whether it has come, or is true. `words` describe it on the page."""
 
     words: str
     holds: Test
@@ -63,25 +64,25 @@ class When(NamedTuple):
 
 
 class Every(NamedTuple):
-    """Hold a period in iterations, 0 for never: words for the page, and its length."""
+    """Hold a period. `length` computes it in iterations, 0 for never. `words` describe it on the page."""
 
     words: str
     length: Callable[[State], int]
 
 
 def share(of: float) -> Every:
-    """Return a period of a part of the training."""
+    """Return a period that is the fraction `of` of the training."""
     return Every(f"{100 * of:g}%", lambda state: max(1, int(of * state.total)))
 
 
 ONCE = Every("once", lambda state: 1)
-"""Each iteration: the part itself knows that it is done."""
+"""Each iteration. The part itself remembers whether it was done."""
 
 
 class Row(NamedTuple):
-    """Tell when one thing is done: in each iteration from `start` on and before `until` whose number `every` divides, if `only_if` holds.
+    """Tell when one thing is done: from `start` on and before `until`, in iterations that are multiples of `every`, if `only_if` holds.
 
-    `clock` is the part of the training's time (`refgs.clock`) that it counts for; None if it keeps the time itself.
+    `clock` is the part of the training's time (`refgs.clock`) for which it counts. It is None if the thing keeps the time itself.
     """
 
     what: str
@@ -92,7 +93,7 @@ class Row(NamedTuple):
     clock: str | None = None
 
     def due(self, state: State, step: Step) -> bool:
-        """Tell whether it is time."""
+        """Tell whether the row is due in this iteration."""
         if self.every and not ((length := self.every.length(state)) and step.done % length == 0):
             return False
         if self.start and not self.start.holds(state, step):
@@ -103,48 +104,48 @@ class Row(NamedTuple):
 
 
 def part(of: float) -> When:
-    """Return the time when this part of the training is over."""
+    """Return the time when the fraction `of` of the training is over."""
     return When(f"{of:.0%}", lambda state, step: step.progress >= of)
 
 
 def part_after_initial(of: float) -> When:
-    """Return the time when this part of the training is over, counted from the end of its initial stage."""
+    """Return the time when the fraction `of` of the training has passed since the end of the initial stage."""
     return When(f"`initial.until` + {of:.0%}", lambda state, step: step.progress - state.settings.initial.until >= of)
 
 
 def iteration(number: int) -> When:
-    """Return the time when so many iterations are done."""
+    """Return the time when `number` iterations are done."""
     return When(f"iteration {number}", lambda state, step: step.done >= number)
 
 
 def setting(key: str) -> When:
-    """Return the time of the setting `key`, "section.name", which is a part of the training."""
+    """Return the time that the setting `key`, "section.name", gives as a fraction of the training."""
     section, name = key.split(".")
     return When(f"`{key}`", lambda state, step: step.progress >= getattr(getattr(state.settings, section), name))
 
 
 def period(key: str) -> Every:
-    """Return the period of the setting `key`, "section.name"."""
+    """Return the period that the setting `key`, "section.name", gives in iterations."""
     section, name = key.split(".")
     return Every(f"`{key}`", lambda state: getattr(getattr(state.settings, section), name))
 
 
 def iterations(count: int) -> Every:
-    """Return a period of so many iterations."""
+    """Return a period of `count` iterations."""
     return Every(f"{count}", lambda state: count)
 
 
 def decidable(state: State, done: int) -> bool:
     """Tell whether surfels, materials and light can be judged after `done` iterations.
 
-    They cannot in the initial stage, while surfels are faint after an opacity reset, and in a method without materials of pixels.
+    They cannot in the initial stage, while surfels are faint after an opacity reset, or if the method does not shade pixels by materials.
     """
     by_pixels = state.method.deferred and state.settings.render.diffuse == "irradiance"
     return by_pixels and not state.initial and not faint_now(state, done)
 
 
 def metals_decidable(state: State, done: int) -> bool:
-    """Tell whether photos decide what is metal: not in schedules that find metals otherwise, or that have no specular shading."""
+    """Tell whether photos can decide now what is metal. They cannot without specular shading, or if the schedule propagates normals."""
     settings = state.settings
     return settings.render.reflection == "microfacet" and not settings.propagation.every and decidable(state, done)
 
@@ -191,7 +192,7 @@ def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total:
 
 
 def stage_at(progress: float, stages: tuple[Stage, ...]) -> Stage:
-    """Return the stage, by its photos' size, of a training at a progress of 0..1."""
+    """Return the stage of a training at a progress of 0..1. Stages differ in the size of the photos."""
     return next(stage for stage in stages if progress < stage.until or stage.until == 1)
 
 
@@ -218,7 +219,7 @@ def _resets(state: State, step: Step) -> bool:
 
 
 def _first_plan(state: State, step: Step) -> bool:
-    """Tell whether so many iterations are done since the plan began that their pace is known, for the first time or again."""
+    """Tell whether to plan the iterations now: 10 iterations after the plan began, when the pace is first known, and every 50th."""
     since = step.done - state.plan.first
     return since == 10 or (since > 0 and step.done % 50 == 0)
 
@@ -263,7 +264,7 @@ BEFORE = (
     Row("set the rates"),
     Row("refine the light", part(0.2), every=ONCE, only_if=LIT),
 )
-"""Is done before the photo is rendered."""
+"""Rows that are done before the photo is rendered."""
 
 WHOLE = Row("train on the whole photo, not on its crop", every=iterations(WHOLE_EVERY))
 FROZEN = (
@@ -271,15 +272,15 @@ FROZEN = (
     (("opacity",), Row("hold opacities", only_if=RESTS)),
     (REFLECTING, Row("hold materials, light and exposures", RESIDUAL)),
 )
-"""Tensors that do not learn."""
+"""Tensors that do not learn, and the row that says when."""
 
 AFTER = (
     Row("refine the view's pose", part(POSES_FROM), part(POSES_UNTIL)),
     Row("remove the poses' common motion", part(POSES_FROM), part(POSES_UNTIL), Every("views", lambda s: len(s.views))),
     Row("diffuse the light", only_if=LIT),
     Row("balance the exposures"),
-    # Meshes and decisions come before an opacity reset makes all surfels faint. Materials would no longer adapt to a mesh that is made
-    # after the residual has started to learn.
+    # Meshes and decisions come before an opacity reset, which makes all surfels faint. No mesh is made after the residual has started to
+    # learn, because materials would no longer adapt to it.
     Row("make a mesh", setting("indirect.start"), RESIDUAL, period("indirect.every"), NOT_INITIAL & NOT_ENDED & OPAQUE),
     Row("decide on inter-reflection", only_if=NEW_MESH, clock="deciding"),
     Row("trace what surfels receive", only_if=NEW_MESH, clock="visibility"),
@@ -324,7 +325,7 @@ AFTER = (
     Row("leave out exposures that agree", part(0.3), None, share(1 / 20), NOT_INITIAL & OPAQUE),
     Row("judge the poses", part(POSES_KNOWN), every=ONCE),
 )
-"""Is done after Adam's step."""
+"""Rows that are done after Adam's step."""
 
 DIVIDE = Row("divide surfels, not only prune", until=setting("densify.stop"))
 PLAN = Row("plan the iterations that fit into the time", only_if=When("10 after the start, then every 50", _first_plan))

@@ -56,11 +56,11 @@ ACTIONS: dict[str, Callable[[State, Step], object]] = {
     "leave out exposures that agree": exposures.leave_out_alike,
     "judge the poses": poses.judge,
 }
-"""What is done in the rows of BEFORE and AFTER."""
+"""Functions that do what the rows of BEFORE and AFTER name."""
 
 
 def walk(rows: tuple[Row, ...], state: State, step: Step) -> None:
-    """Do what is due of the rows of a timeline, in their order."""
+    """Do what is due in the rows of a timeline, in their order."""
     for row in rows:
         if row.due(state, step):
             with state.clock.part(row.clock) if row.clock else nullcontext():
@@ -140,14 +140,14 @@ class Trainer:
         more = growth(state.learned.count, state.settings.surfels.budget)
         state.plan.begin(state.iteration, more, state.part(coarse.Coarse).stages)
         while not state.ended and not self._should_stop(stop):
-            means.add(self.iterate())  # read now and then: a card need not wait
+            means.add(self.iterate())  # values are read only now and then, so that the CPU need not wait for a card
             now = Step(state)
             if PLAN.due(state, now):
                 state.total = state.plan.total(state.iteration, len(state.views) + len(state.test)) or state.total
             if REPORT.due(state, now) or state.ended:
                 release_memory([*state.views, *state.test])
                 self._check(whole=state.ended)
-                # It may have gone back.
+                # The training may have gone back to a checkpoint.
                 pace = (state.seconds - before) / max(coarse.cost(state, first, state.iteration), 1e-9)
                 self._report_progress(pace)
             now = Step(state)
@@ -184,7 +184,7 @@ class Trainer:
         """
         begun, used = time.perf_counter(), time.process_time()
         figures = self._try_step()
-        while figures is None:  # out of the attempt, whose traceback held its tensors
+        while figures is None:  # try again outside the attempt, whose traceback held its tensors
             densify.fewer_surfels(self.state)
             figures = self._try_step()
         self.state.seconds += time.perf_counter() - begun
@@ -204,7 +204,7 @@ class Trainer:
         self._check(whole=True)
         with self.state.clock.part("writing"):
             snapshot.save(self.state)
-            trim()  # what decisions took
+            trim()  # free the memory that decisions took
 
     def _check(self, whole: bool) -> None:
         """Check that the training's numbers are finite. If `Guard.look` returns a reason, go back to the last checkpoint, and warn.
@@ -220,7 +220,7 @@ class Trainer:
             warn(state, why)
 
     def release_photos(self) -> None:
-        """Drop all photos, when the training has ended: the files that they are mapped from can then be removed, on Windows, too."""
+        """Drop all photos when the training has ended. Windows cannot remove their files while they are mapped."""
         self.state.views, self.state.photos, self.state.test = [], [], []
         self.state.part(coarse.Coarse).photos = []
         del self.measures

@@ -16,7 +16,7 @@ class Initial(Need):
     moments = ("start",)
 
     def due(self, state: State, moment: Moment) -> bool:
-        # From the hull, deferred shading finds better normals alone than after this stage: docs/notebook/ablations.md.
+        # If surfels start on the hull, deferred shading alone finds better normals than after this stage: docs/notebook/ablations.md.
         left_out = state.from_hull or self.asked(state) == "off"
         return left_out and state.settings.initial.until > 0 and state.method.deferred
 
@@ -36,7 +36,8 @@ class Iterations(Need):
 
     name, what = "iterations", "all iterations"
     moments, follows = ("start",), "specular"
-    ENOUGH = 0.8  # part of the iterations left after which matte scenes are as good as after all: docs/notebook/needs-and-minutes.md
+    # Fraction of the remaining iterations after which matte scenes are as good as after all: docs/notebook/needs-and-minutes.md.
+    ENOUGH = 0.8
 
     def due(self, state: State, moment: Moment) -> bool:
         matte = not state.needed("specular")
@@ -46,7 +47,7 @@ class Iterations(Need):
     def measure(self, state: State, given: Given) -> Decision:
         done, specular = given.done, state.needs.get("specular")
         total = done + round(self.ENOUGH * (state.total - done))
-        left, why = 0.0, ASKED  # seconds
+        left, why = 0.0, ASKED  # `left` is in seconds
         statistic = threshold = None
         if specular and specular.statistic is not None:
             statistic, threshold = specular.statistic, specular.threshold

@@ -11,17 +11,17 @@ from refgs.geometry.project import inside, project, sample
 from refgs.model import harmonics
 from refgs.model.environment import turn_between
 
-PHOTO_SIDE = 96  # pixels: the hull is not the object in finer detail
+PHOTO_SIDE = 96  # largest side of a sampled picture, in pixels: the hull does not fit the object in finer detail
 POINTS = 2000
-FRONTAL = 0.3  # cosine to the camera above which a point is used
-BEHIND = 0.1  # scene radii behind the foremost point at which a point is hidden
-DEGREE = 3  # of the harmonics
-FLOOR = 0.01  # radiance that is added, so that black has a logarithm
+FRONTAL = 0.3  # a point is used if the cosine between its normal and the camera's direction is above this
+BEHIND = 0.1  # scene radii; a point this far behind the foremost one counts as hidden
+DEGREE = 3  # of the spherical harmonics
+FLOOR = 0.01  # radiance added to all, so that black has a logarithm
 FOLDS = 4
-FEWEST = 3  # photos of a point that tell its own brightness
+FEWEST = 3  # a point's own brightness is known if at least this many photos show it
 PENALTY = 1e-4
 PASSES = 4
-LESS = 0.95  # of the error under a still light: the light turns only where it explains clearly more
+LESS = 0.95  # the light turns only if its model's error is below this fraction of that of a still light
 
 
 def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float) -> tuple[str, str]:
@@ -120,10 +120,10 @@ def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray,
         columns = np.column_stack([values, terms])
         of_photo = np.zeros((photos.max() + 1, columns.shape[1]))
         of_point = np.zeros((points.max() + 1, columns.shape[1]))
-        for _ in range(PASSES):  # means of points and of photos, one after the other
+        for _ in range(PASSES):  # average over points and over photos in turn
             of_point = _means(columns[known] - of_photo[photos[known]], points[known], points.max() + 1)
             of_photo = _means(columns[known] - of_point[points[known]], photos[known], photos.max() + 1)
-        columns = columns - of_point[points] - of_photo[photos]  # zero so far for the photos to predict
+        columns = columns - of_point[points] - of_photo[photos]  # `of_photo` is still zero for the photos to predict
         y, x = columns[:, 0], columns[:, 1:]
         normal = x[known].T @ x[known] + PENALTY * known.sum() * np.eye(x.shape[1])
         error = (y - x @ np.linalg.solve(normal, x[known].T @ y[known]))[asked]
@@ -135,7 +135,7 @@ def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray,
 def _means(values: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
     """Average the rows of `values` (M, K) that belong to the same group. Returns (groups, K).
 
-    `group` (M,) is the group's index of each row, and `groups` is the number of groups. Empty groups get zero.
+    `group` (M,) holds the index of each row's group, and `groups` is the number of groups. Empty groups get zero.
     """
     sums = np.stack([np.bincount(group, column, groups) for column in values.T], axis=1)
     return sums / np.maximum(np.bincount(group, minlength=groups), 1)[:, None]

@@ -12,7 +12,8 @@ from refgs.train.decide.need import ASKED, MEGA, NUMBER, Decision, Given, Moment
 from refgs.train.learn import light
 from refgs.train.state import RenderInputs, State
 
-VISIBLE = 0.1  # dB of a small part of the object (`probe.PART`), where the rest hides it in the mean
+# PSNR in dB over a small part of the object (`probe.PART`): in the mean, the rest of the object hides it.
+VISIBLE = 0.1
 
 
 class Reflections(Need):
@@ -22,9 +23,11 @@ class Reflections(Need):
     threshold = 0.1  # dB
     reason = "it is between mirroring black and mirroring the light: more than the object's own light can be worth"
     moments = ("start", "mesh")
-    # Part of `indirect.least` from which a small part counts: a mesh of 32 voxels hides 0.15 % of a ball from itself, one of 96 none.
+    # A small part of the object counts from this fraction of `indirect.least` on. As a mesh of 32 voxels, a ball hides 0.15 % of itself; as
+    # one of 96, nothing.
     HOLLOW = 0.3
-    SMALL_PART = 3.0  # dB of a small part (`probe.PART`); a black dielectric of roughness 0.5 has 2.4, a chrome bell 6, a mirror 20
+    # PSNR in dB over a small part (`probe.PART`); a black dielectric of roughness 0.5 has 2.4, a chrome bell 6, a mirror 20.
+    SMALL_PART = 3.0
 
     def due(self, state: State, moment: Moment) -> bool:
         return moment == "mesh" or self.asked(state) == "off"
@@ -47,7 +50,7 @@ class Reflections(Need):
         why += f", where mirroring black would change the pictures by {explained.whole:.2f} dB"
         if hidden >= least and explained.whole >= self.threshold:
             return Decision(True, why, {}, explained.whole)
-        # A hollow chrome knob on a clay jar: the clay, which is most of the object, hides it in both means.
+        # A hollow chrome knob on a clay jar needs this: clay is most of the object, and hides the knob in both means.
         why += f", {explained.part:.2f} where it shows most"
         needed = explained.part >= self.SMALL_PART
         return Decision(needed, why, {} if needed else self._saved(state), explained.part, self.SMALL_PART)
@@ -78,8 +81,9 @@ class Light(Need):
     name, what = "light", "all of the light's texels"
     threshold, reason = 0.01, "dB; a coarser light that costs more is not taken, whatever the roughness"
     moments, follows = ("light",), "specular"
-    GLOSSIEST = probe.PART / 2  # part of the picture that may be glossier than the roughness that texels are chosen for
-    LOBE = 0.5  # part of a lobe's width that a texel may take
+    # Fraction of the picture that may be glossier than the roughness for which texels are chosen.
+    GLOSSIEST = probe.PART / 2
+    LOBE = 0.5  # fraction of a lobe's width that a texel may take
 
     def due(self, state: State, moment: Moment) -> bool:
         return moment == "light"

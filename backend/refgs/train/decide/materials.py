@@ -13,9 +13,11 @@ from refgs.train.material.observe import observe_changes
 from refgs.train.start import start_appearance
 from refgs.train.state import RenderInputs, State, why_not_traced
 
-SHINES = 0.042  # of 1; matte clay has 0.037, an embossed gold cape in flat light 0.056, a mirror 0.2
-SMALL_PART = 1.0  # dB of a small part (`probe.PART`); matte clay has -1.2, a clay pig with a chrome bell 1.7
-RARE = 1e-3  # part of the pictures, at either end, whose surfels do not count for a common value
+# Change of encoded colour with the view, of 1; matte clay has 0.037, an embossed gold cape in flat light 0.056, a mirror 0.2.
+SHINES = 0.042
+SMALL_PART = 1.0  # dB over a small part (`probe.PART`); matte clay has -1.2, a clay pig with a chrome bell 1.7
+# Fraction of the pictures, at either end of the values, whose surfels are ignored in the search for a common value.
+RARE = 1e-3
 INDIRECT = "indirect_dc", "indirect_rest", "received"
 
 
@@ -40,11 +42,12 @@ class Specular(Need):
         why = f"what is mirrored explains {explained.whole:.2f} dB of the photos beyond one colour a surfel"
         if explained.whole >= self.threshold:
             return Decision(True, why, statistic=explained.whole)
-        # A chrome bell on a clay pig: the clay, which is most of the object, hides it in the mean.
+        # A chrome bell on a clay pig needs this: clay is most of the object, and hides the bell in the mean.
         why += f", {explained.part:.2f} where it shows most"
         if explained.part >= SMALL_PART:
             return Decision(True, why, statistic=explained.part, threshold=SMALL_PART)
-        # Normals are not right yet, and an embossed metal has no sharp reflections: it explains nothing, and yet it shines.
+        # Normals are still wrong, and an embossed metal has no sharp reflections. So specular shading explains nothing, though the metal
+        # shines.
         change = change_seen(observe_changes(state), state.wanted())
         why += f"; colours change with the view by {change:.3f} of 1"
         if change >= SHINES:

@@ -9,7 +9,14 @@ from refgs.formats.needs import Found
 from refgs.train.state import State
 
 Moment = Literal["photos", "start", "specular", "light", "degrees", "mesh", "asset"]
-"""When needs are decided: photos are read, parameters are ready, the need's row in the timeline, a mesh is made, the asset is written."""
+"""Moments at which needs are decided:
+
+- "photos": photos are read
+- "start": parameters are ready
+- "specular", "light", "degrees": the row of this need in the timeline is due
+- "mesh": a mesh is made
+- "asset": the asset is written
+"""
 
 ASKED = "its setting leaves it out"
 NUMBER = 4 * 4  # bytes: a float, its derivative and Adam's two moments
@@ -31,7 +38,7 @@ class Decision(NamedTuple):
     threshold: float | None = None
     once: Callable[[], None] = (
         lambda: None
-    )  # done when it is decided; its result is in checkpoints, or made by each start
+    )  # called once, when this is decided; its result is in checkpoints, or each start makes it again
 
 
 class Given(NamedTuple):
@@ -39,7 +46,8 @@ class Given(NamedTuple):
 
     - `done`: how many iterations are done.
     - `hidden`: the fraction of the object's pixels that mirror the object.
-    - `common`: of metallic and roughness, those that have about the same value for all of `kept` surfels: the value and the range's width.
+    - `common`: the common values of metallic and roughness, if nearly all surfels in `kept` share one: by name, the value and the range's
+      width.
     """
 
     done: int = 0
@@ -54,12 +62,12 @@ class Need:
     `refgs.train.decide.needs` lists all of them.
     """
 
-    name: ClassVar[str]  # also in the settings' `needs`
-    what: ClassVar[str]  # words for the artist
+    name: ClassVar[str]  # also the key in the settings' `needs`
+    what: ClassVar[str]  # words that the artist reads
     threshold: ClassVar[float] = math.nan
-    reason: ClassVar[str] = ""  # for the threshold
+    reason: ClassVar[str] = ""  # why the threshold is what it is
     moments: ClassVar[tuple[Moment, ...]]
-    follows: ClassVar[str] = ""  # a need after whose decision this one is asked, too, and with which it is taken back
+    follows: ClassVar[str] = ""  # name of another need: this one is decided after it as well, and taken back with it
 
     def due(self, state: State, moment: Moment) -> bool:
         """Tell whether to decide about this optional part now, at this moment of the training.

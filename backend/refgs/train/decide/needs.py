@@ -31,7 +31,7 @@ NEEDS: tuple[Need, ...] = (
     Degrees(),
     CONSTANTS,
 )
-"""In the order in which those of one moment are decided."""
+"""Needs that are due at the same moment are decided in this order."""
 
 BY_NAME = {need.name: need for need in NEEDS}
 
@@ -65,13 +65,13 @@ def evaluate(state: State, moment: Moment, given: Given = Given()) -> list[str]:
 
 
 def look_again(state: State, step: Step) -> None:
-    """Bring specular shading back if it is found halfway that a scene is not matte, and all that was left out with it."""
+    """Bring specular shading back, and all that was left out with it, if the scene halfway turns out not to be matte."""
     if decision := SPECULAR.look_again(state):
         _bring_back_specular(state, decision)
 
 
 def bring_back_specular(state: State, why: str) -> bool:
-    """Bring specular shading back, with all that was left out with it, as `why` says. Returns False if a setting left it out."""
+    """Bring specular shading back, and all that was left out with it. `why` is the reason. Returns False if a setting left it out."""
     if state.needed(SPECULAR.name) or SPECULAR.asked(state) != "auto":
         return False
     _bring_back_specular(state, Decision(True, why))
@@ -97,7 +97,7 @@ def _undo_following(state: State, decisions: dict[str, Found], why: str) -> None
 
 
 def reflections(state: State, step: Step) -> None:
-    """Decide by a new mesh whether the scene needs inter-reflection. Once this is decided, only report how much mirrors itself."""
+    """Decide with a new mesh whether the scene needs inter-reflection. Once decided, only report how much of the object mirrors itself."""
     hidden = step.hidden or 0.0
     if not evaluate(state, "mesh", Given(step.done, hidden)):
         state.announce("reflections", f"with {Reflections.what}: {share_hidden(hidden)}")
@@ -127,7 +127,7 @@ def restore(state: State, recorded: dict[str, Found]) -> None:
     `recorded` are the checkpoint's decisions by name. If the training goes back to an earlier checkpoint, later decisions stay.
     """
     before, now = (decisions.get(SPECULAR.name) for decisions in (recorded, state.needs))
-    if before and now and now.needed and not before.needed:  # taken back after this checkpoint
+    if before and now and now.needed and not before.needed:  # brought back after this checkpoint
         _undo_following(state, recorded, now.why)
     state.needs = recorded | state.needs
     for name, found in state.needs.items():

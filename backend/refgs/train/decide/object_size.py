@@ -1,4 +1,4 @@
-"""Measure how large the object is in the photos, and allow as many surfels as that takes."""
+"""Measure how large the object is in the photos, and limit the number of surfels to what this size needs."""
 
 from statistics import median
 from typing import NamedTuple
@@ -9,15 +9,15 @@ from refgs.settings import SurfelSettings
 from refgs.train.photo import crop_of
 from refgs.train.state import State, spread
 
-SIZE_VIEWS = 24  # that are looked at, at the most
-LEAST_GROWTH = 2  # times as many surfels as at the start are allowed, however small the object is
+SIZE_VIEWS = 24  # views that are measured, at most
+LEAST_GROWTH = 2  # even the smallest object may get this many times the surfels of the start
 
 
 class ObjectSize(NamedTuple):
-    """Hold the object's size in the full photos, in pixels: medians over views. Both are 0 if it is not known, without masks.
+    """Hold the object's size in the full photos, in pixels: medians over views. Both are 0 if photos without masks leave it unknown.
 
-    `span` is the longer side of a mask's bounds, and `area` is the number of pixels in the mask. With a region to train, they are at most
-    those of the ball around that.
+    `span` is the longer side of a mask's bounds, and `area` is the number of pixels in the mask. With a region to train, neither is larger
+    than that of the ball around the region.
     """
 
     span: float
@@ -43,14 +43,14 @@ def object_size(state: State) -> ObjectSize:
 
 
 def surfel_budget(settings: SurfelSettings, area: float) -> int:
-    """Return how many surfels an object of `area` pixels in a photo gets at the most: `density` a pixel, but no more than `budget`."""
+    """Return how many surfels an object of `area` pixels in a photo may get: `density` per pixel, but no more than `budget`."""
     if settings.density == 0:
         return settings.budget
     return min(settings.budget, max(LEAST_GROWTH * settings.start, round(settings.density * area)))
 
 
 def limit_surfels(state: State, area: float) -> None:
-    """Lower the surfel budget to what an object of `area` pixels in a photo takes."""
+    """Lower the surfel budget to what an object of `area` pixels in a photo needs."""
     if (budget := surfel_budget(state.settings.surfels, area)) < state.settings.surfels.budget:
         known = f"the object covers {area:,.0f} pixels of a photo" if area else "no masks show the object's size"
         state.change("surfels.budget", budget, "photos", known)

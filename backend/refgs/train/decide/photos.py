@@ -12,7 +12,8 @@ from refgs.train.photo import MARGIN, crop_of
 from refgs.train.state import State
 from refgs.train.timeline import WHOLE_EVERY, Step
 
-ALIKE_PIXELS, ALIKE_DECIBELS = 0.5, 40.0  # duplicates move by less, and differ by no more than 8-bit photos' noise
+# Duplicates move by fewer pixels, and their PSNR is higher: they differ by 8-bit noise alone.
+ALIKE_PIXELS, ALIKE_DECIBELS = 0.5, 40.0
 
 
 class Views(Need):

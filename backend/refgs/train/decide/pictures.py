@@ -1,4 +1,4 @@
-"""Write pictures of a training view rendered with an optional part of the training and without it, when it is decided.
+"""Write pictures of a training view with and without an optional part of the training, when it is decided whether to leave it out.
 
 They show the artist what a decision of `refgs.train.decide.needs` is about. They are written to the run folder, in `needs/`.
 """
@@ -18,10 +18,10 @@ from refgs.train import probe
 from refgs.train.state import RenderInputs, State
 
 PICTURES = "needs"  # in the run folder
-SHOWN_SIDE = 320  # pixels of a picture on its longer side: a panel shows no more
+SHOWN_SIDE = 320  # pixels of a picture's longer side: a panel shows no more
 
 Pair = Callable[[State, Found, list[int]], Iterator[tuple[Tensor, Tensor]]]
-"""Renders views with a part and without it: encoded pictures (H, W, 3). The second argument is the recorded decision."""
+"""Function that renders views with a part and without it: encoded pictures (H, W, 3). Its second argument is the recorded decision."""
 
 
 @torch.no_grad()
@@ -35,7 +35,7 @@ def write_pictures(state: State, name: str, found: Found) -> Pictures | None:
         return None
     views = probe.spread_views(state)
     most, chosen, pair = -1.0, -1, ()
-    for view, (on, off) in zip(views, PAIRS[name](state, found, views), strict=False):  # all views or none
+    for view, (on, off) in zip(views, PAIRS[name](state, found, views), strict=False):  # yields all views or none
         on, off = on.clamp(0, 1), off.clamp(0, 1)
         if (apart := float((on - off).square().mean())) > most:
             most, chosen, pair = apart, view, (on, off)
@@ -63,12 +63,14 @@ def _reduced(picture: Tensor) -> np.ndarray:
 
 
 def _specular(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render what is mirrored, and the same as if it did not change with the view."""
+    """Render the views with reflections, and with reflections that do not change with the view."""
     return probe.mirrored_and_mean(state, state.inputs(), views)
 
 
 def _reflections(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render the object's mean radiance where it hides the light from what mirrors it, and the light everywhere.
+    """Render two guesses at what the object mirrors where it hides the light: its own mean radiance, and the light behind it.
+
+    The object's true reflection of itself is not known before it is traced.
 
     What the object mirrors of itself is not known before it is traced.
     """
@@ -102,4 +104,4 @@ def _light(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tenso
 
 
 PAIRS: dict[str, Pair] = {"specular": _specular, "reflections": _reflections, "light": _light}
-"""The needs that have pictures, and how these are rendered."""
+"""Functions that render the pictures, by the need's name. Other needs have no pictures."""

@@ -12,9 +12,9 @@ from refgs.model.surfels import Surfels
 from refgs.train.learn.exposures import exposure
 from refgs.train.state import RenderInputs, State
 
-TRADE_VIEWS = 6  # at the most
-SMALL = 0.02  # part of a change over which its derivative is taken
-UNSEEN = 0.25  # of the pictures' own error: a smaller change adds at most 6 % to its square
+TRADE_VIEWS = 6  # training views that are compared, at most
+SMALL = 0.02  # fraction of a change that is made to estimate its derivative
+UNSEEN = 0.25  # fraction of the pictures' own error: a smaller change adds at most 6 % to its square
 
 Explanation = tuple[Surfels, Tensor]
 """Surfels, and radiance (6·R², 3)."""
@@ -55,7 +55,7 @@ def _rougher(old: Explanation, size: float) -> Explanation:
 
 
 def _more_metal(old: Explanation, size: float) -> Explanation:
-    # Towards the other kind.
+    # Move metal towards paint, and paint towards metal.
     return old[0]._replace(metallic=old[0].metallic + size * (1 - 2 * old[0].metallic)), old[1]
 
 
@@ -110,7 +110,7 @@ def ambiguities(state: State) -> dict[str, dict]:
             scenes = trade.change(now, SMALL * trade.size), trade.made_up(now, SMALL)
             dots = torch.zeros(
                 2, 2, dtype=torch.double
-            )  # of the two changes' pictures, from view to view: photos may be large
+            )  # dot products of both changes, summed view by view, because photos may be large
             for old, *pair in zip(before, *(_pictures(state, scene, chosen) for scene in scenes), strict=True):
                 changes = [((picture - old) / SMALL).double().flatten() for picture in pair]
                 dots += torch.tensor([[float(a @ b) for b in changes] for a in changes])

@@ -35,10 +35,10 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
     """Write the results of a training into its run folder.
 
     These are the surfels (splats.ply), the light (environment.exr), and what the training left out (needs.json). With inter-reflection, the
-    object's mesh is written to occluder.ply. With learned exposures or poses, cameras.json is written again to include them. Where photos
-    decide what is metal, splats.ply says where they do not tell, and metrics.json on how much of the surface.
+    object's mesh is written to occluder.ply. With learned exposures or poses, cameras.json is written again to include them. If photos
+    decide what is metal, splats.ply also has each surfel's doubt, and metrics.json has the fraction of the surface that is in doubt.
 
-    A run that has splats.ply has ended. So this file is written last, after a call of `before_splats`.
+    A run that has splats.ply counts as finished. So this file is written last, after `before_splats` is called.
     """
     with torch.no_grad():
         surfels = with_normals_last(state.surfels())
@@ -102,11 +102,11 @@ def _with_relightable_albedo(surfels: Surfels, state: State) -> Surfels:
 
 
 REWRITES = (_without_unlearned, _without_untraced, _with_relightable_albedo)
-"""What becomes of the surfels, in this order: base colours take into account what was traced of `received`."""
+"""Changes to the surfels before they are written, in this order: base colours depend on whether `received` was traced."""
 
 
 def _with_constants(surfels: Surfels, state: State, kept: Tensor) -> tuple[Surfels, dict[str, float]]:
-    """Give all surfels the same metallic, roughness or specular where these are about the same. Return these values by name, too.
+    """Set metallic, roughness and specular to one value for all surfels, if they are about the same. Return these values by name, too.
 
     splats.ply then needs no column for them. Only surfels whose entry in `kept` (N,) is true are compared.
     """

@@ -1,6 +1,6 @@
 """Write and read checkpoints: a safetensors file for the tensors, a TOML file for the rest.
 
-The last two complete checkpoints are kept. The TOML file begins with a hash of both files' contents, by which damage is noticed.
+The last two complete checkpoints are kept. The TOML file begins with a hash of both files' contents, so that damage is noticed.
 """
 
 import errno
@@ -57,7 +57,7 @@ def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[s
     for old in complete(folder)[:-KEPT]:
         for file in reversed(_files(folder, old)):
             file.unlink()
-    for file in folder.glob("*.safetensors"):  # of a process that was killed between the two files
+    for file in folder.glob("*.safetensors"):  # left by a process that was killed between writing the two files
         if not file.with_suffix(".toml").exists():
             file.unlink()
 
@@ -70,7 +70,7 @@ def complete(folder: Path) -> list[int]:
 def load(folder: Path, report: Report = lambda event, facts: None) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read the tensors, and the other values as a dictionary, from the last complete checkpoint that is not damaged.
 
-    Later ones, which are damaged, are renamed and reported with a line each. Raises NoCheckpoint if none is left.
+    Later checkpoints, which are damaged, are renamed, and each is reported with one line. Raises NoCheckpoint if none is left.
     """
     for iteration in reversed(_begun(folder)):
         try:
@@ -103,7 +103,7 @@ def _files(folder: Path, iteration: int) -> tuple[Path, Path]:
 def _read(folder: Path, iteration: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read a checkpoint. Raises one of many errors if it is damaged."""
     data, note = _files(folder, iteration)
-    whole_text = read_text(note, "").replace("\r\n", "\n")  # as it was hashed
+    whole_text = read_text(note, "").replace("\r\n", "\n")  # with the line ends that were hashed
     head, _, text = whole_text.partition("\n")
     if not head.startswith(_HASH):  # an earlier release wrote none
         text = whole_text
@@ -116,7 +116,7 @@ def _read(folder: Path, iteration: int) -> tuple[dict[str, Tensor], dict[str, An
 
 
 def _hash(data: Path, text: str) -> str:
-    """Hash the contents of a checkpoint's two files, the second without its first line."""
+    """Hash the contents of a checkpoint's two files, except the first line of the TOML file, which holds the hash."""
     found = hash_file(data)
     found.update(text.encode())
     return found.hexdigest()

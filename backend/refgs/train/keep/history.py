@@ -14,8 +14,9 @@ from refgs.train.keep.progress import Means
 from refgs.train.state import State
 from refgs.train.timeline import FIRST_LINE
 
-SHARE = 0.025  # of the training's time that measuring may take; FLIP, as dear as all else, may take as much again
-BESIDE = ("reading", "start", "writing", "measuring", "FLIP")  # parts of the clock that are not in a training's seconds
+# Fraction of the training's time that measuring may take; FLIP, as slow as the rest, may take as much again.
+SHARE = 0.025
+BESIDE = ("reading", "start", "writing", "measuring", "FLIP")  # parts of the clock that do not count as training time
 
 
 def allowed(iteration: int, total: int, seconds: float) -> float:
@@ -36,8 +37,7 @@ def allowed(iteration: int, total: int, seconds: float) -> float:
 def record(state: State, measures: Measures) -> None:
     """Add a line to the history that describes the training now.
 
-    Errors against held-out photos and
-    ground truth are measured if there is time for it (see `allowed`).
+    Errors against held-out photos and ground truth are measured if there is time for it (see `allowed`).
     """
     means = state.part(Means)
     limit = math.inf if state.ended else allowed(state.iteration, state.total, state.seconds)
@@ -63,7 +63,7 @@ def record(state: State, measures: Measures) -> None:
 def trim(folder: Path, iteration: int, report: Report) -> None:
     """Remove from the history the lines of iterations after `iteration`, because the training will do these iterations again.
 
-    Damaged lines are removed, too, and reported. What cannot be read in its place is set aside, and reported.
+    Damaged lines are removed, too, and reported. If the history cannot be read at all, it is set aside, and that is reported.
     """
     file = folder / FILE
     try:

@@ -21,7 +21,8 @@ def write_preview(state: State) -> dict[str, str | int]:
     view = (state.test or state.views)[0]
     with torch.no_grad():
         wanted = state.wanted()
-        surfels = state.surfels().chosen(wanted if wanted.any() else ~wanted)  # all, where the region is empty by now
+        # All, if no surfel is left in the region.
+        surfels = state.surfels().chosen(wanted if wanted.any() else ~wanted)
         rendering = state.render(view.camera, surfels)
         write_png(folder / "view.png", color_picture(rendering, np.array(state.settings.image.background)))
         write_splats(folder / "splats.ply", to_splats(with_normals_last(surfels)))

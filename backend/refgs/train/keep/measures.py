@@ -17,9 +17,9 @@ from refgs.render.renderer import Rendering, render
 from refgs.run import light_of
 from refgs.train.state import State, spread
 
-MEASURED_VIEWS = 4  # that are measured
-SLOW_VIEWS = 2  # of them for what is slow: FLIP, which takes as long as ten renderings, and relighting
-ROWS = 128  # of the lights that are compared
+MEASURED_VIEWS = 4  # held-out views that are measured, at most
+SLOW_VIEWS = 2  # of these, views for slow measures: relighting, and FLIP, which takes as long as ten renderings
+ROWS = 128  # rows of the panoramas that are compared
 
 
 def held_out_psnr(state: State, most: int = MEASURED_VIEWS) -> float | None:
@@ -74,7 +74,8 @@ class Measures:
         if to_capture is not None:
             known, alpha = known_maps(truth, view, camera, to_capture)
         left = {"visibility"}
-        if self.settings.render.diffuse == "sh":  # base colour is recovered from it when the training has ended
+        # Base colour is computed from SH colours only when the training has ended.
+        if self.settings.render.diffuse == "sh":
             left |= {"albedo"}
         elif truth and truth.hdris and self._method.lit:
             relit = truth.relit(truth.hdris[0], camera)
@@ -85,7 +86,8 @@ class Measures:
         """Read two lights from the ground truth: the light of the photos, and another light under which the capture has true pictures."""
         if not self._method.lit:
             return
-        if truth.has_light and self.settings.light.frame != "camera":  # the true light stands still
+        # Else the training's light turns with the camera, and the true one does not.
+        if truth.has_light and self.settings.light.frame != "camera":
             self._panorama = metrics.resized(truth.panorama("light"), ROWS)
         if any(test.relit is not None for test in self._test_views):
             light = light_of(truth.panorama(f"relight/{truth.hdris[0]}"), self.settings)

@@ -35,7 +35,7 @@ def save(state: State) -> None:
 
 
 def restore(state: State, run: Path) -> None:
-    """Take over the last complete checkpoint of a run that is not damaged.
+    """Take over the last checkpoint of a run that is complete and not damaged.
 
     Raises `checkpoint.NoCheckpoint` if there is none, and InputError if another release of RefGS wrote it.
     """

@@ -1,1 +1,1 @@
-"""Learn surfels, light, exposures and poses: what is done in each iteration, or now and then."""
+"""Learn surfels, light, exposures and poses. Some modules act in each iteration, others only now and then."""

@@ -1,6 +1,6 @@
-"""Train on reduced photos first: an iteration takes about as long as it has pixels, and the first ones need no fine ones.
+"""Train on reduced photos first: an iteration's time grows with the number of pixels, and early iterations need no fine ones.
 
-Small objects are trained on full photos from the start: of an object of 64 pixels, half the size loses 0.3 dB.
+Small objects are trained on full photos from the start: for an object that spans 64 pixels, photos of half the size lose 0.3 dB.
 """
 
 from collections.abc import Mapping
@@ -15,13 +15,13 @@ from refgs.train.plan import FULL, Stage, iterations_time
 from refgs.train.state import State
 from refgs.train.timeline import PHOTO_STAGES, POSES_KNOWN, Step, stage_at
 
-LEAST_SPAN = 200  # pixels of the object in reduced photos
+LEAST_SPAN = 200  # pixels that the object must span in reduced photos
 
 
 class Coarse(Part):
-    """Remember the stages of the training by its photos' sizes, and the reduced photos of the stage that it is in.
+    """Remember the training's stages, each with its own size of photos, and the reduced photos of the present stage.
 
-    `factor` is that by which the sides of `photos` are reduced, 1 for full photos. `crops` are the parts of `photos` that are trained on.
+    The sides of `photos` are reduced by `factor`, which is 1 for full photos. `crops` are the parts of `photos` that are trained on.
     """
 
     name, saved = "coarse", ("factor",)
@@ -37,14 +37,14 @@ class Coarse(Part):
 
 
 def stages(pixels: float) -> tuple[Stage, ...]:
-    """Plan the stages of a training of an object that spans so many `pixels` in the full photos."""
+    """Plan the stages of a training whose object spans so many `pixels` in the full photos."""
     return *(Stage(*stage) for stage in PHOTO_STAGES if pixels / stage[1] >= LEAST_SPAN), *FULL
 
 
 def begin(state: State, pixels: float, refined: bool) -> None:
-    """Choose the stages of a training of an object that spans so many `pixels` in the full photos, and start with the first one.
+    """Choose the stages of a training whose object spans so many `pixels` in the full photos, and start with the first one.
 
-    Poses that are `refined` take full photos from when they are judged on.
+    If poses are `refined`, full photos are used from the time on at which poses are judged.
     """
     if state.settings.image.coarse == "off":
         return
@@ -78,7 +78,7 @@ def set_factor(state: State, factor: int) -> None:
     coarse = state.part(Coarse)
     if factor == coarse.factor:
         return
-    coarse.photos, coarse.crops, coarse.factor = [], None, factor  # first, for their memory
+    coarse.photos, coarse.crops, coarse.factor = [], None, factor  # drop the old photos first, to free their memory
     if factor > 1:
         with state.clock.part("reading"):
             views: list[LoadedView] = reduced_views(state.views, factor, state.folder / PHOTOS)

@@ -17,7 +17,7 @@ from refgs.train.start import AROUND
 from refgs.train.state import State
 from refgs.train.timeline import DIVIDE, RESET, Step
 
-LEFT_SURFELS = 0.8  # of the surfels, where there is no memory for all
+LEFT_SURFELS = 0.8  # fraction of the surfels that stays if memory is full
 LEAST_LEFT = 1000
 
 
@@ -45,17 +45,17 @@ class Densification(Part):
 
 
 def watch(state: State, step: Step, accepted: Tensor) -> None:
-    """Add the view's gradients of the positions to their mean on the screen, if the step is `accepted`."""
+    """Add this view's gradients of the positions to their mean on the screen, if the step is `accepted`."""
     position, gradient = state.learned["position"], state.part(Densification).gradient
     if position.grad is not None:
         gradient.add(position.detach(), position.grad, state.photos[step.view].camera, accepted)
 
 
 def prune_and_divide(state: State, step: Step) -> None:
-    """Remove faint surfels, and divide others unless it is too late for that."""
+    """Remove faint surfels. Until `densify.stop`, also divide others."""
     settings, budget = state.settings.densify, state.settings.surfels.budget
     gradient = state.part(Densification).gradient.mean()
-    if state.capture.box is not None:  # surfels beside the region get no more than their share of the budget
+    if state.capture.box is not None:  # surfels outside the region may fill only the fraction AROUND of the budget
         wanted = state.wanted()
         ranked = torch.where(wanted, torch.inf, gradient).argsort(descending=True)
         count = int(wanted.sum())
@@ -84,7 +84,7 @@ def densify(learned: Learned, gradient: Tensor, settings: DensifySettings, budge
         count = min(room, int((candidates > settings.gradient).sum()))
         chosen = candidates.topk(count).indices.sort().values
     kept = torch.nonzero(keep)[:, 0]
-    index = torch.cat([kept, chosen])  # each chosen one stands twice
+    index = torch.cat([kept, chosen])  # each surfel to divide is taken twice
     if len(index) == len(keep) and len(chosen) == 0:
         return 0
     halves = torch.isin(kept, chosen).nonzero()[:, 0], torch.arange(len(kept), len(index), device=keep.device)
@@ -155,7 +155,7 @@ def _divide(learned: Learned, first: Tensor, second: Tensor) -> None:
     rows = torch.arange(len(first), device=first.device)
     sigma = scale[rows, longer].exp()
     axis = torch.stack(axes(learned["rotation"][first]))[longer, rows]
-    # Two Gaussians of 0.8 σ, 0.6 σ either side of the centre: the same variance as the one, 0.8² + 0.6² = 1.
+    # Two Gaussians of 0.8 σ, each 0.6 σ from the centre, have the variance of the divided one: 0.8² + 0.6² = 1.
     for half, sign in ((first, 1.0), (second, -1.0)):
         learned["position"][half] += sign * 0.6 * sigma[:, None] * axis
         learned["scale"][half, longer] = scale[rows, longer] + math.log(0.8)

@@ -1,4 +1,4 @@
-"""Learn a photo's exposure and white balance, and stop learning those that turn out to be about the same in all photos."""
+"""Learn each photo's exposure and white balance. Stop learning them if they turn out to be about the same in all photos."""
 
 import math
 
@@ -9,12 +9,12 @@ from refgs.train.part import Part
 from refgs.train.state import State
 from refgs.train.timeline import Step
 
-# Changes of a photo's response, as logarithms of factors of red, green and blue: brightness, then temperature and tint, which are its white
-# balance. The latter two are scaled down so that they learn more slowly: photos differ less in them.
+# Ways in which a photo's response may change, as logarithms of factors of red, green and blue: brightness, temperature and tint. The last
+# two are the white balance. They are scaled down so that they learn more slowly, because photos differ less in them.
 EXPOSURE = (1.0, 1.0, 1.0), (0.5, 0.0, -0.5), (-0.25, 0.5, -0.25)
 # A third of a stop, the step of a camera's dial: smaller differences may be errors of the shading.
 ALIKE = math.log(2) / 3
-BALANCED = 0.1  # largest difference of a channel's logarithm that may be an error of the shading, too
+BALANCED = 0.1  # largest difference of a channel's logarithm that may still be an error of the shading
 
 
 class Exposures(Part):
@@ -29,8 +29,9 @@ class Exposures(Part):
 def exposure(state: State, view: int | slice) -> Tensor | None:
     """Compute a view's exposure (3,): factors of its rendered red, green and blue. Return None if exposures are not learned.
 
-    What is learned are the weights of the rows of EXPOSURE in the factors' natural logarithms. If it has only one column, the photos have
-    the same white balance, and a view's three factors are equal. A slice of views gives the exposures of all of them (V, 3).
+    The training learns a weight for each row of EXPOSURE. The weighted sum of the rows is the natural logarithm of the factors. With only
+    one weight per view, all photos have the same white balance, and a view's three factors are equal. A slice of views gives the exposures
+    of all of them (V, 3).
     """
     weights = state.learned.get("exposure")
     return None if weights is None else (weights[view] @ state.part(Exposures).basis[: weights.shape[1]]).exp()
@@ -38,7 +39,7 @@ def exposure(state: State, view: int | slice) -> Tensor | None:
 
 @torch.no_grad()
 def balance(state: State, step: Step) -> None:
-    """Make the photos' white balances neutral in the mean. Without this, a coloured light in all photos could not be told from theirs."""
+    """Make the mean white balance of all photos neutral. Otherwise a coloured light could be mistaken for a white balance of all photos."""
     weights = state.learned.get("exposure")
     if weights is not None and weights.shape[1] > 1:
         weights[:, 1:] -= weights[:, 1:].mean(dim=0)
@@ -54,7 +55,7 @@ def leave_out_alike(state: State, step: Step) -> None:
     brightness = logarithms.mean(dim=1)
     tint = logarithms - brightness[:, None]
     apart = [(value - value.median(dim=0).values).abs().max() for value in (brightness, tint)]
-    differs, tinted = torch.stack(apart).tolist()  # a card waits here, once in a while
+    differs, tinted = torch.stack(apart).tolist()  # this waits for the graphics card, but rarely
     if tinted >= BALANCED:
         return
     if differs < ALIKE:

@@ -10,7 +10,7 @@ from refgs.model.learned import Learned
 from refgs.train.learn.densify import Densification
 from refgs.train.state import State
 
-MOST_IN_A_ROW = 30  # steps that may be left out before the training goes back
+MOST_IN_A_ROW = 30  # steps in a row that may be skipped before the training goes back to a checkpoint
 
 
 class Guard:
@@ -20,7 +20,7 @@ class Guard:
     """
 
     def __init__(self, device: torch.device):
-        self._counts = torch.zeros(3, device=device)  # left out, in all and in a row; taken
+        self._counts = torch.zeros(3, device=device)  # skipped steps, in all and in a row; steps that were taken
         self._seen, self._said, self._gone_back, self._taken = 0, 0, -1, -1
 
     @torch.no_grad()
@@ -54,7 +54,7 @@ class Guard:
         worse, self._seen = total > self._seen, total
         if not (worse or whole):
             return ""
-        if total > 2 * self._said:  # warn each time the count has doubled, not every ten iterations
+        if total > 2 * self._said:  # warn when the count has doubled, not every ten iterations
             self._said = total
             warn(state, f"steps not taken so far, for the loss or a gradient was not finite: {total}")
         count = remove_broken(state.learned)

@@ -26,10 +26,11 @@ from refgs.train.timeline import Step
 
 LEAST_SIDE = 16  # texels along a side
 DIFFUSED = (
-    64  # texels along a side at which `environment.diffusion` holds; it reaches as far on the sphere at other sides
+    # Texels along a side for which `environment.diffusion` is given; at other sides, it reaches as far on the sphere.
+    64
 )
-MIRROR_VIEWS = 24  # that say which part of the light the object mirrors
-MIRROR_SIDE = 16  # texels along a side of the cubemap that says which directions are mirrored
+MIRROR_VIEWS = 24  # views that tell which part of the light the object mirrors
+MIRROR_SIDE = 16  # texels along a side of the coarse cubemap in which mirrored directions are counted
 
 
 class MirroredLight(Part):
@@ -74,11 +75,11 @@ def coarsen(state: State, side: int) -> None:
 @timed("optimiser")
 @torch.no_grad()
 def diffuse(state: State, step: Step) -> None:
-    """Smooth the light a little: let neighbouring texels of a cubemap face flow into each other, and let each texel fade to grey.
+    """Smooth the light a little: blend each texel with its neighbours on the cubemap face, and fade it towards grey.
 
-    How much they do is proportional to the light's learning rate. This is a step of its own beside the optimiser's, like decoupled weight
-    decay (Loshchilov and Hutter 2019). Where the photos agree on a texel, the optimiser moves it faster than this step, and details and
-    colours stay. Where only noise moves the texels, they become alike and grey. The mean over all texels and channels does not change.
+    Both effects are proportional to the light's learning rate. They are a step apart from the optimiser's, like decoupled weight decay
+    (Loshchilov and Hutter 2019). Where the photos agree on a texel, the optimiser moves it faster than this step, and details and colours
+    stay. Where only noise moves the texels, they become alike and grey. The mean over all texels and channels does not change.
     """
     side = math.isqrt(len(state.learned["environment"]) // 6)
     rate, settings = state.learned.rates["environment"], state.settings.environment
@@ -95,7 +96,7 @@ def diffuse(state: State, step: Step) -> None:
 
 
 def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
-    """Average the light's radiance (3,) over what the object mirrors towards the cameras, each pixel alike.
+    """Average the light's radiance (3,) over the pixels in which cameras see it mirrored. All these pixels count equally.
 
     Returns None if the scene has no light, or if no term of the loss uses this mean.
     """
@@ -114,9 +115,9 @@ def mirrored(
 ) -> Tensor:
     """Return a weight for each texel of the light (6·R²,), where R is the cubemap's side. The weights sum to one.
 
-    The weight is proportional to the number of pixels in which the cameras see the texel's surroundings mirrored in the object. A direction
-    that a few pixels mirror could otherwise take any colour to make the mean grey. If no texel is mirrored, all texels are weighted by
-    their solid angles. Surfels nearer to a camera than `near` are not drawn.
+    The weight is proportional to the number of pixels in which the cameras see the texel's surroundings mirrored in the object. Without it,
+    directions that only a few pixels mirror could take any colour to make the mean grey. If no texel is mirrored, all texels are weighted
+    by their solid angles. Surfels nearer to a camera than `near` are not drawn.
     """
     pixels = torch.zeros(6 * MIRROR_SIDE * MIRROR_SIDE)
     settings = settings.model_copy(update={"reflection": "microfacet"})  # treat matte surfaces as reflective here

@@ -16,9 +16,9 @@ from refgs.render.ssim import dssim
 from refgs.settings import LossSettings
 from refgs.train.photo import Photo
 
-TILE = 32, 8  # pixels of a row, and rows, that a block of losses.cpp has on CUDA
+TILE = 32, 8  # width and height, in pixels, of a block of losses.cpp on CUDA
 ROUND_OFF = 0.02
-SUMS = 3  # of a row or a block: of the loss, of the pixels with a surface, of squared errors
+SUMS = 3  # sums of each row or block: loss, pixels with a surface, squared errors
 
 
 class Objective(NamedTuple):
@@ -112,7 +112,8 @@ class _Objective(Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, by_loss, _):
-        one = not load.on_gpu(by_loss) and by_loss == 1  # nearly always; on a card, reading it would wait
+        # Nearly always true; on a graphics card, reading the value would wait.
+        one = not load.on_gpu(by_loss) and by_loss == 1
         scaled = ctx.gradients if one else [None if g is None else by_loss * g for g in ctx.gradients]
         return *scaled, None, None, None, None
 
@@ -121,7 +122,7 @@ def departure(exposure: Tensor) -> Tensor:
     """Compute a loss that keeps a photo's exposure near one. `exposure` (K,) is a row of `State.exposures`.
 
     Without this loss, a brighter light with shorter exposures would fit the photos as well. The loss is the sum of the absolute values,
-    smoothed near zero. Unlike squares, they let a few photos differ strongly without moving the others.
+    smoothed near zero. Absolute values, unlike squares, let a few photos differ strongly without moving the others.
     """
     return (torch.sqrt(exposure * exposure + ROUND_OFF**2) - ROUND_OFF).sum()
 

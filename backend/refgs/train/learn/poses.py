@@ -1,10 +1,10 @@
 """Refine the cameras' poses during the training, and find out whether they need it.
 
-Each view has a pose (see `render.align`), which moves the scene before its camera sees it. Whenever a view is trained on, its pose takes a
-Gauss-Newton step towards the photo, first in reduced pictures, so that a camera that is off by some pixels finds back.
+Each view has a pose (see `render.align`), which moves the scene in front of its camera. Whenever a view is trained on, its pose takes a
+Gauss-Newton step towards the photo. The first steps use reduced pictures, so that a camera that is off by some pixels still converges.
 
-Features that photos have in common tell whether poses need that, and whether it has made them better. The photos' own errors cannot: poses
-also move where a mirror's image, which is not at rest on the mirror, is not explained yet.
+Features that photos have in common tell whether poses need refinement, and whether they have become better. The error against the photos
+cannot tell: poses also move to fit mirrored images that the scene does not explain yet, and a mirrored image is not at rest on its mirror.
 """
 
 from collections.abc import Mapping
@@ -23,17 +23,18 @@ from refgs.train.part import Part
 from refgs.train.state import State
 from refgs.train.timeline import POSES_FROM, POSES_KNOWN, Step
 
-LONGEST_STEP = 0.02  # of a step: radians, and scene radii
+LONGEST_STEP = 0.02  # largest step, in radians and in scene radii
 SAMPLE = 1000  # surfels whose shift in the photos is measured
-EXACT = 0.3  # pixels between features and their epipolar lines: poses with less are exact; four real captures have 0.1
-BETTER = 0.5  # of the given poses' distance, below which the refined ones must come
+# Pixels between features and their epipolar lines; poses with less count as exact; four real captures have 0.1.
+EXACT = 0.3
+BETTER = 0.5  # refined poses must come below this fraction of the given poses' distance
 
 
 class Poses(Part):
     """Remember the poses of the views.
 
-    `given` are the views' cameras in the capture, and `values` (V, 6) the poses that move the scene before them; None if cameras are the
-    given ones. `judged` tells whether `judge` has compared both.
+    `given` are the views' cameras in the capture. `values` (V, 6) are the poses; None means that the given cameras are used. `judged` tells
+    whether `judge` has compared both.
     """
 
     name, saved = "poses", ("judged", "values")
@@ -41,7 +42,10 @@ class Poses(Part):
     judged = False
 
     def start(self, state: State) -> None:
-        """Give every view a pose, zero, if the setting `cameras.poses` is "on", or "auto" and features contradict the given poses."""
+        """Give every view a zero pose, if poses are to be refined.
+
+        They are if the setting `cameras.poses` is "on", or if it is "auto" and features contradict the given cameras.
+        """
         self.given, wanted = [view.camera for view in state.views], state.settings.cameras.poses
         if wanted == "auto":
             with state.clock.part("start"):
@@ -57,7 +61,7 @@ class Poses(Part):
         self.put(state, facts["values"].cpu() if "values" in facts else None)
 
     def put(self, state: State, values: Tensor | None) -> None:
-        """Set the poses of all views, or None: then all cameras are the given ones."""
+        """Set the poses of all views. With None, all cameras are the given ones."""
         self.values = values
         for view in range(len(state.views)):
             self.move(state, view)
@@ -97,12 +101,15 @@ def remove_common(state: State, step: Step) -> None:
 
 
 def judge(state: State, step: Step) -> None:
-    """Once, go back to the given poses if the setting `cameras.poses` is "auto" and features do not fit the refined ones far better."""
+    """Once, compare the refined cameras with the given ones. Go back to the given ones unless features fit the refined ones far better.
+
+    This is done only if the setting `cameras.poses` is "auto".
+    """
     poses = state.part(Poses)
     if poses.values is None or state.settings.cameras.poses != "auto" or poses.judged:
         return
     poses.judged = True
-    # The pairs that `start` matched: neighbours may be others by now, with too few matches to tell.
+    # Match the pairs that `start` matched. Refined cameras may have other neighbours, with too few matches to tell.
     matches = match_neighbours(
         [replace(view, camera=camera) for view, camera in zip(state.views, poses.given, strict=True)]
     )
@@ -147,7 +154,7 @@ def refined(state: State) -> Capture:
 
 
 def _without_common(state: State, values: Tensor) -> Tensor:
-    """Return the poses without what moves the scene as a whole: their mean, and the mean motion towards the cameras, which scales it."""
+    """Return the poses without their common motion: the mean pose, and the mean motion towards the cameras, which scales the scene."""
     towards = np.array([camera.position - state.capture.centre for camera in state.part(Poses).given])
     towards = torch.from_numpy(towards / np.linalg.norm(towards, axis=1, keepdims=True)).float()
     poses = values - values.mean(dim=0)

@@ -1,11 +1,11 @@
-"""Lean on normals and depth that other programs guessed from single photos, early in the training.
+"""Use normals and depth that other programs guessed from single photos, early in the training.
 
-Photos of mirrors and hollows can also be explained by wrong shapes, such as the visual hull's lid over a bowl. What a network guesses from
-one photo knows of bowls. It is wrong in detail, and its depth has no scale. So its terms of the loss saturate, and fade to nothing: photos
-have the last word.
+Photos of mirrors and hollows can also be explained by wrong shapes, such as the visual hull's lid over a bowl. A network that guesses from
+one photo knows what bowls look like. Its guess is wrong in detail, and its depth has no scale. So these terms of the loss saturate, and
+fade to zero: in the end, only the photos count.
 
-Programs write normals with different axes. The ones that agree best with the surfels at the start are taken, for all views alike. Depth
-is fitted to what is rendered, by a scale and a shift a view, each time that it is used.
+Programs write normals with different axes. The axes that agree best with the surfels at the start are used for all views. Depth is fitted
+to the rendered depth each time that it is used, with one scale and one shift per view.
 """
 
 import math
@@ -25,17 +25,18 @@ from refgs.train.state import State, spread
 from refgs.train.timeline import Step
 
 FADED = 0.6  # part of the training after which priors have no weight
-PRIOR_VIEWS = 16  # that are looked at to find what the files mean, at the most
-OUTLINE = 80  # part of a photo's side that counts as near an outline
-AGREES = 0.35  # least correlation across the view, near outlines: of a bowl 0.58, with 15° of noise 0.48; of other scenes' normals 0.32
-WRONG = 0.5  # 1 − cosine of a normal that is as likely wrong as the surface: its pull is a quarter
-FAR = 0.1  # distance, in scene radii, of a depth that is as likely wrong as the surface
-ROUNDS = 3  # of reweighting in the fit of depth
-CODE = 127  # of a component of 1 in a map of normals
+PRIOR_VIEWS = 16  # views that are looked at, at most, to find out what the files mean
+OUTLINE = 80  # a pixel is near an outline within this part of the photo's longer side: 1/80
+# Least correlation with the outlines' shape; near outlines, normals of a bowl have 0.58, with 15° of noise 0.48, others 0.32.
+AGREES = 0.35
+WRONG = 0.5  # 1 − cosine at which a guessed normal is as likely wrong as the surface: its pull is a quarter there
+FAR = 0.1  # scene radii of distance at which a guessed depth is as likely wrong as the surface
+ROUNDS = 3  # rounds of reweighting in the fit of depth
+CODE = 127  # code of the component 1 in a map of normals
 
 
 Maps = dict[int, tuple[Tensor, Camera]]
-"""Guesses by the view's number: a map, and the photo's camera for its size."""
+"""Guesses by the view's index: a map, and the photo's camera in the map's size."""
 
 
 class Priors(Part):
@@ -57,7 +58,7 @@ class Priors(Part):
 def load(state: State) -> None:
     """Load the priors of the training views, and find out what they mean: the axes of normals, and whether depth is a disparity.
 
-    They are used only if all photos have masks: else nothing is known of the shape to compare them with.
+    Priors are used only if all photos have masks. Without masks, no shape is known with which to compare them.
     """
     given = {view.camera.name: view for view in state.capture.train_views if view.prior_normals or view.prior_depth}
     if state.settings.loss.prior == 0 or not given:
@@ -96,7 +97,7 @@ def loss(state: State, step: Step) -> Tensor | None:
 
 
 def fade(progress: float) -> float:
-    """Return the part of their weight that priors have at a progress of 0..1: half a wave of a cosine, from 1 to 0 at FADED."""
+    """Return the factor on the weight of priors at a progress of 0..1: half a cosine wave, from 1 down to 0 at FADED."""
     return 0.5 + 0.5 * math.cos(math.pi * min(progress / FADED, 1.0))
 
 
@@ -104,7 +105,7 @@ def normals_loss(rendering: Rendering, photo: Photo, codes: Tensor, camera: Came
     """Compute how far rendered normals are from guessed ones: a scalar.
 
     `codes` (H, W, 3) int8 are unit vectors times CODE in the axes of a camera (x right, y down, z forward), 0 where not known. `camera` is
-    the photo's for their size. The loss of a pixel is e / (e + WRONG), where e is 1 − the cosine: it saturates.
+    the photo's camera in the size of `codes`. The loss of a pixel saturates: it is e / (e + WRONG), where e is 1 − the cosine.
     """
     guessed = at_pixels(codes, camera, photo.camera).to(rendering.normal) / CODE
     counts = _counts(rendering, photo) * (guessed.square().sum(dim=-1) > 0.5)
@@ -116,20 +117,23 @@ def normals_loss(rendering: Rendering, photo: Photo, codes: Tensor, camera: Came
 def depth_loss(
     rendering: Rendering, photo: Photo, guessed: Tensor, camera: Camera, disparity: bool, radius: float
 ) -> Tensor:
-    """Compute how far rendered depth is from guessed depth (H, W), or disparity, that is scaled and shifted to fit it best: a scalar.
+    """Compute how far rendered depth is from guessed depth or disparity (H, W), scaled and shifted to fit best: a scalar.
 
-    Guesses are 0 where not known. `camera` is the photo's for their size. The loss of a pixel is r² / (r² + FAR²), where r is the distance
-    in scene radii: it saturates.
+    Guesses are 0 where not known. `camera` is the photo's camera in the size of the guess. The loss of a pixel saturates: it is r² / (r² +
+    FAR²), where r is the distance in scene radii.
     """
     guessed, depth = at_pixels(guessed, camera, photo.camera), rendering.depth
     counts = _counts(rendering, photo) * (guessed > 0)
-    guessed = torch.where(counts > 0, guessed, 0)  # a far background would overflow
+    guessed = torch.where(counts > 0, guessed, 0)  # a distant background would overflow
     target, fits = fitted(guessed, depth.detach(), counts, disparity, radius)
     return _saturating(((depth - target) / radius).square(), FAR**2, counts * fits, photo)
 
 
 def at_pixels(values: Tensor, camera: Camera, pixels: Camera) -> Tensor:
-    """Look up a map (H, W, …) of `camera` at the pixels of another camera in the same place, of another size, or of a crop. Nearest."""
+    """Look up a map (H, W, …) of `camera` at the pixels of another camera, and take the nearest values.
+
+    That camera is in the same place. It may have another size, or be a crop.
+    """
     found = []
     for axis, (size, focal, centre) in enumerate((("height", "fy", "cy"), ("width", "fx", "cx"))):
         offset = torch.arange(getattr(pixels, size), device=values.device) + (0.5 - getattr(pixels, centre))
@@ -142,7 +146,7 @@ def fitted(guessed: Tensor, depth: Tensor, counts: Tensor, disparity: bool, radi
     """Scale and shift guessed depth or disparity (H, W) to fit `depth` (H, W) best, by robust least squares.
 
     Pixels are weighted by `counts`, and by less the farther they are from the fit (Cauchy's weights, at FAR scene radii). Returns the depth
-    (H, W), and a scalar: 1, or 0 if the guess falls where depth rises. No gradients.
+    (H, W), and a scalar: 1, or 0 if the guess falls where depth rises. Neither has gradients.
     """
     wanted = 1 / depth.clamp_min(1e-6 * radius) if disparity else depth
     weight, found, slope = counts, depth, counts
@@ -165,8 +169,8 @@ def axes_of(pairs: Iterable[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor | No
     - the guessed ones, as they are in the file
     - the guessed ones turned to the camera's axes, as if those in the file were in world space
 
-    Returns the signs (3,) by which the file's x, y and z have to be multiplied, None if they are in world space, whichever gives the larger
-    mean cosine. Also returns how well x and y agree then: the smaller of their correlations.
+    Returns the signs (3,) by which to multiply the file's x, y and z, or None if the normals are in world space. The answer with the larger
+    mean cosine is chosen. Also returns how well x and y agree then: the smaller of their correlations.
     """
     sums = torch.zeros(2, 3, 3, dtype=torch.float64)
     for seen, *guesses in pairs:
@@ -223,9 +227,9 @@ def _with_axes(state: State, normals: Maps) -> Maps:
 
 
 def _near_outline(photo: Photo) -> Tensor:
-    """Tell which pixels (H, W) of a photo's mask lie just inside its outline: there the visual hull has the surface's normals.
+    """Tell which pixels (H, W) lie just inside the outline of a photo's mask.
 
-    This holds over a bowl, too.
+    There, the visual hull has the normals of the surface, even where its lid covers a bowl.
     """
     if photo.mask is None:
         return torch.zeros(photo.image.shape[:2], dtype=torch.bool, device=photo.image.device)
@@ -236,9 +240,9 @@ def _near_outline(photo: Photo) -> Tensor:
 
 
 def _with_kind(state: State, depth: Maps) -> tuple[Maps, bool]:
-    """Return the maps of depth, or none if they are unlike that of the surfels at the start; and whether they are disparities.
+    """Return the maps of depth, and whether they hold disparities. Drop all if they are unlike the depth of the first surfels.
 
-    Disparity falls where depth rises: its correlation with depth is negative.
+    Disparity falls where depth rises, so its correlation with depth is negative.
     """
     if not depth:
         return {}, False

@@ -13,7 +13,7 @@ def set_rates(state: State, step: Step) -> None:
         if name == "position":
             decay = rates.position_decay ** min(progress / rates.position_until, 1)
         elif name in REFLECTING:
-            # Material and light have cooled when the residual starts to learn: they must not give way to it.
+            # Rates of materials and light have decayed when the residual starts to learn: they must not give way to it.
             decay = rates.decay ** min(progress / late, 1)
         elif name == "sh_rest" and late < 1:
             decay = rates.decay ** (max(progress - late, 0) / (1 - late))

@@ -21,7 +21,7 @@ from refgs.train.part import Fact, Part
 from refgs.train.state import State, why_not_traced
 from refgs.train.timeline import Step
 
-MESH_VIEWS = 24  # at least, that the mesh is fused from; all where there are fewer
+MESH_VIEWS = 24  # views from which the mesh is fused, at least; all, if there are fewer
 
 
 class TracedMesh(Part):
@@ -43,13 +43,13 @@ class TracedMesh(Part):
 
 @torch.no_grad()
 def make_mesh(state: State, step: Step) -> None:
-    """Make a new mesh from the surfels to trace on, and measure on how much of the object it mirrors itself (`step.hidden`)."""
+    """Make a new mesh from the surfels to trace on. Measure which fraction of the object mirrors the object (`step.hidden`)."""
     if why_not_traced(state):
         return
     with state.clock.part("visibility"):
         capture, cameras = state.capture, state.spread_cameras(MESH_VIEWS)
         state.occluder = None
-        trim()  # before the depth maps of all cameras are held
+        trim()  # free memory for the depth maps of all cameras
         inputs = state.inputs()
         inside = inputs.surfels.chosen(state.wanted())
         with state.clock.part("mesh"):
@@ -74,9 +74,10 @@ def make_mesh(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def trace_received(state: State, step: Step) -> None:
-    """Trace how much of the light each surfel receives: with each new mesh, for light and mesh are better known by then."""
+    """Trace how much of the light each surfel receives. Do this with each new mesh, because light and mesh are better known by then."""
     if state.occluder is None or "received" not in state.learned:
         return
     traced = Surfels(*(value.cpu() for value in with_normals_last(state.surfels())))
-    light = Environment(state.inputs().light.radiance.cpu())  # in the world's frame: in the camera's nothing is traced
+    # In the world's frame: nothing is traced if the light turns with the camera.
+    light = Environment(state.inputs().light.radiance.cpu())
     state.learned["received"][:] = received(traced, state.occluder, light)

@@ -1,7 +1,7 @@
 """Measure how the object's radiance changes with the viewing direction, and whether it changes as a metal's does.
 
-Nothing here needs normals that are right: an embossed metal has no sharp reflections, yet the radiance of each of its points changes from
-photo to photo. A matte surface under a light that stands still looks the same from everywhere.
+Nothing here needs correct normals. An embossed metal has no sharp reflections, yet the radiance of each of its points changes from photo to
+photo. A matte surface under a light that stands still looks the same from everywhere.
 """
 
 import math
@@ -21,15 +21,19 @@ from refgs.train.material.observe import (
     pooled,
 )
 
-FEW = 32  # of them, where the size of the change is asked and not its colour: pooling evens it out
-SATURATED = 0.08  # distance of a chromaticity from grey, below which metals and dielectrics change alike: silver has 0.03, copper 0.14
-CHANGES = 0.15  # change relative to the mean radiance, below which it may be texture that is slightly out of place
-FAINT_CHANGES = 0.08  # enough where neighbours change clearly, and alike
-FAINTEST_CHANGES = 0.05  # may be noise, unless nearly all of the surface has them; embossed gold has 0.07 to 0.2
-GROWTH = 8  # steps from neighbours to neighbours
-LOW = 0.15  # part of the photos in which a surfel is darker than where its drop is measured; fewer may be shadows or outlines
-DROP = 0.08  # of the light's mean radiance; a dielectric mirrors 0.04 of the light, and so cannot fall by much more below its median
-FALLS = 0.88  # part of its median to which a metal falls, which has no diffuse light; paint falls to 0.94 or less far
+FEW = 32  # neighbours, where the size of a change is asked and not its colour: averaging over more would even it out
+# Distance of a chromaticity from grey; below it, metals and dielectrics change alike; silver has 0.03, copper 0.14.
+SATURATED = 0.08
+CHANGES = 0.15  # relative to the mean radiance; smaller changes may be texture that is slightly misaligned
+FAINT_CHANGES = 0.08  # enough for surfels whose neighbours change clearly, in their own colour as well
+# May be noise, unless nearly the whole surface changes so much; embossed gold has 0.07 to 0.2.
+FAINTEST_CHANGES = 0.05
+GROWTH = 8  # times that metals spread to their neighbours
+LOW = 0.15  # quantile of a surfel's radiance at which its drop is measured; darker photos may be shadows or outlines
+# Least drop, relative to the light's mean radiance; a dielectric mirrors 0.04 of the light, and cannot fall much farther below its median.
+DROP = 0.08
+# A metal falls below this fraction of its median, because it has no diffuse light; paint does not fall below 0.94.
+FALLS = 0.88
 METAL_TINT = 0.6  # tint of the change (0: grey as a dielectric's reflection; 1: of the surface's own colour)
 
 
@@ -53,8 +57,8 @@ class Shining(NamedTuple):
 def change_seen(observations: Observations, wanted: Tensor) -> float:
     """Measure how much the surface changes with the viewing direction: a cubic mean over the surfels `wanted` (N,).
 
-    A surfel's change is the standard deviation of its sRGB-encoded colour over the photos. Each surfel counts with its pixels. A cubic mean
-    lets a small part that changes much, such as a chrome handle, count more than a plain mean would. 0 if no surfel is usable.
+    A surfel's change is the standard deviation of its sRGB-encoded colour over the photos. Surfels are weighted by their pixels. A cubic
+    mean lets a small part that changes much, such as a chrome handle, count more than a plain mean would. Returns 0 if no surfel is usable.
     """
     usable = observations.usable
     count = usable.sum(dim=1).clamp_min(2)
@@ -70,9 +74,9 @@ def change_seen(observations: Observations, wanted: Tensor) -> float:
 def shines_as_metal(observations: Observations, positions: Tensor) -> Shining:
     """Find the surfels that change with the view as a coloured metal does.
 
-    A metal tints what it reflects: its radiance changes along its own colour. A dielectric's reflection has the light's colour, grey on the
-    average, whatever the colour below. The direction of change is the first principal axis of the linear radiance over the photos. Radiance
-    is averaged over neighbours first: texture that is slightly out of place then cancels, and highlights do not. Surfels near grey tell
+    A metal tints what it reflects: its radiance changes along its own colour. A dielectric's reflection has the light's colour, which is
+    grey on average, whatever colour lies below. The direction of change is the first principal axis of the linear radiance over the photos.
+    Radiance is first averaged over neighbours: slightly misaligned texture then cancels, and highlights do not. Surfels near grey tell
     nothing.
     """
     near = neighbours(positions, NEIGHBOURS)
@@ -98,11 +102,11 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Shining:
 
 @torch.no_grad()
 def falls_as_metal(observations: Observations, positions: Tensor, light: float) -> Tensor:
-    """Find the surfels (N,) that fall so far below their median in some photos that only a metal does, grey or not.
+    """Find the surfels (N,) of any colour whose radiance falls so far below its median in some photos that they must be metal.
 
-    A dielectric's diffuse radiance is the same in all photos, and it mirrors only a twenty-fifth of the light: its highlights may rise far,
-    but without them it is hardly darker than in the median. A metal is as dark as what it mirrors. `light` is the light's mean radiance.
-    Radiance is averaged over a few neighbours, so that texture that is slightly out of place hardly counts.
+    A dielectric has the same diffuse radiance in all photos, and mirrors only a twenty-fifth of the light. Highlights may make it far
+    brighter, but without them it is hardly darker than its median. A metal is as dark as what it mirrors. `light` is the light's mean
+    radiance. Radiance is averaged over a few neighbours, so that slightly misaligned texture hardly counts.
     """
     near = neighbours(positions, FEW)
     mean, change, known = averaged(observations, near)

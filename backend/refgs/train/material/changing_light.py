@@ -16,23 +16,30 @@ from torch import Tensor
 from refgs.render.relight import mirror, sphere
 from refgs.train.material.observe import LEAST_PIXELS, LEAST_VIEWS, Observations, averaged, neighbours, pooled
 
-SURFELS = 3000  # that are looked at, at the most
-LEAST_SURFELS = 400  # fewer tell nothing
+SURFELS = 3000  # surfels that are looked at, at most
+LEAST_SURFELS = 400  # fewer surfels tell nothing
 SMOOTHED = 32  # neighbours whose normals are averaged: those of single surfels are rough early in the training
-LOBES, SHARPNESS = 50, 10.0  # of the function of the mirrored direction: lobes 0.3 radians wide, which cover the sphere
-RIDGE = 1e-3  # of the columns' mean square
-CHANGED = 0.13  # by which a changed light explains more than mirroring; matte clay has 0.19, seven metals up to 0.08, a sharp mirror 0.17
-LEFT = 0.05  # part of the rest that mirroring explains, below which light changed; matte clay has 0.03, a sharp mirror 0.14
-NOISE = 0.3  # part that both explain, below which changes are noise; a fox's fur has up to 0.19, six coloured metals from 0.42
-CELL = 0.15  # scene radii: one half of the cells of a grid is fitted, and the other half tells how well
+# Number and sharpness of the lobes that sum to the function of the mirrored direction; 0.3 radians wide, they cover the sphere.
+LOBES, SHARPNESS = 50, 10.0
+RIDGE = 1e-3  # ridge, as a fraction of the columns' mean square
+# A light changed only if it explains this much more than mirroring; matte clay has 0.19, seven metals up to 0.08, a sharp mirror 0.17.
+CHANGED = 0.13
+# A light changed only if mirroring explains less than this of the rest; matte clay has 0.03, a sharp mirror 0.14.
+LEFT = 0.05
+# Changes are noise if both models together explain less than this; a fox's fur has up to 0.19, six coloured metals from 0.42.
+NOISE = 0.3
+# Side of a grid's cells, in scene radii: models are fitted to one half of the cells and tested on the other.
+CELL = 0.15
 
 
 class Explained(NamedTuple):
-    """Hold which part of the variance of a surface's changes is explained, on surfels that were not fitted to. NaN if too few are seen.
+    """Hold which fraction of the variance of a surface's changes is explained. It is measured on surfels that were not fitted to.
 
-    - `lit`: by a light that changed, as a linear function of the normal, another one in each photo.
+    - `lit`: by a light that changed, as a linear function of the normal that differs from photo to photo.
     - `mirrored`: by an exposure of each photo and one function of the mirrored direction.
     - `both`: by both together.
+
+    All are NaN if too few surfels are seen.
     """
 
     lit: float
@@ -41,7 +48,7 @@ class Explained(NamedTuple):
 
     @property
     def by_changes(self) -> bool:
-        """Tell whether a light that changed explains clearly more than mirroring, which then explains hardly any of the rest.
+        """Tell whether a light that changed explains clearly more than mirroring does, and mirroring explains hardly any of the rest.
 
         In a single photo of a mirror, the mirrored direction is a function of the normal, too, so `lit` alone tells nothing.
         """
@@ -49,20 +56,21 @@ class Explained(NamedTuple):
 
     @property
     def by_mirroring(self) -> bool:
-        """Tell whether what is mirrored explains much, and the light did not change."""
+        """Tell whether mirroring explains much, and the light did not change."""
         return self.mirrored > NOISE and not self.by_changes
 
     @property
     def by_none(self) -> bool:
-        """Tell whether the changes are noise, which neither explains."""
+        """Tell whether the changes are noise: neither model explains them."""
         return self.both < NOISE
 
 
 @torch.no_grad()
 def explained(observations: Observations, positions: Tensor, radius: float, *parts: Tensor) -> list[Explained]:
-    """Explain how parts of a surface change with the view, by a light that changed from photo to photo and by what they mirror.
+    """Measure how well a changed light, and how well mirroring, explains the way that parts of a surface change with the view.
 
-    Changes and normals are averaged over neighbours. Each of `parts` (N,) is a choice of surfels. `radius` is the scene's.
+    Changes and normals are averaged over neighbours. Each of `parts` (N,) is a mask of surfels, and gets one result. `radius` is the
+    scene's.
     """
     near = neighbours(positions, SMOOTHED)
     mean, change, known = averaged(observations, near)
@@ -76,7 +84,10 @@ def explained(observations: Observations, positions: Tensor, radius: float, *par
 
 
 def _explained(observations: Observations, relative: Tensor, known: Tensor, cells: Tensor) -> Explained:
-    """Explain the changes `relative` (N, V) to the mean radiance, where they are `known` (N, V). One cell of `cells` (N, 3) is 1 wide."""
+    """Fit both models to the changes `relative` (N, V) where they are `known` (N, V), and measure what they explain.
+
+    Changes are relative to the mean radiance. `cells` (N, 3) are positions in units of the grid's cells.
+    """
     chosen = known.any(dim=1).nonzero()[:, 0]
     if len(chosen) < LEAST_SURFELS:
         return Explained(math.nan, math.nan, math.nan)
@@ -100,7 +111,7 @@ def _explained(observations: Observations, relative: Tensor, known: Tensor, cell
 
 
 def _unexplained(target: Tensor, columns: Tensor, weight: Tensor, fitted: Tensor) -> float:
-    """Return the mean square that `columns`, fitted to `target` by ridge regression, leave of it where they are not `fitted`."""
+    """Fit `columns` to `target` by ridge regression where `fitted` is true. Return the mean squared residual elsewhere."""
     rows = columns[fitted] * weight[fitted, None]
     square = rows.T @ columns[fitted]
     ridge = RIDGE * square.diagonal().mean().clamp_min(1e-12) * torch.eye(len(square)).to(square)

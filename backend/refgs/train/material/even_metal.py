@@ -1,9 +1,9 @@
 """Learn the relief of coloured metal as normals, not as paint.
 
-Base colours and roughness that differ from surfel to surfel explain the light and shade of an embossed metal as well as normals do, and
-they learn faster. Until late in the training, both are therefore averaged over neighbours where the surface is coloured metal, and normals
-have to explain what is finer. After that, the photos add what normals do not explain, such as dirt in the hollows. Grey metals are left
-alone: print, brushing and tarnish are real patterns on them, of a colour of their own or none.
+Base colour and roughness that differ from surfel to surfel explain the shading of an embossed metal as well as normals do, and they learn
+faster. So both are averaged over neighbours of coloured metal until late in the training, and normals must explain finer detail. After
+that, the photos add what normals do not explain, such as dirt in the hollows. Grey metals are left alone: print, brushing and tarnish are
+real patterns on them, with a colour or without.
 """
 
 import torch
@@ -21,7 +21,7 @@ METALLIC = 0.8
 
 
 def coloured_metal(surfels: Surfels) -> Tensor:
-    """Tell which surfels (N,) are coloured metal, as far as they have learned."""
+    """Tell which surfels (N,) are coloured metal, by the materials learned so far."""
     return (surfels.metallic > METALLIC) & (from_grey(surfels.albedo).norm(dim=1) > SATURATED)
 
 
@@ -29,7 +29,7 @@ def coloured_metal(surfels: Surfels) -> Tensor:
 def even_out(state: State, step: Step) -> None:
     """Average base colour and roughness of coloured metal over neighbours.
 
-    Opaque neighbours count more, and only those that are coloured metal, too.
+    Only neighbours of coloured metal count. The more opaque they are, the more they count.
     """
     if not state.part(Metals).found:
         return

@@ -1,10 +1,10 @@
-"""Give surfels a first metallic by how they change with the viewing direction.
+"""Set a first metallic for surfels by how they change with the viewing direction.
 
-Photos of a rough or embossed metal are explained about as well by paint, and training starts near paint: it would stay there. The tint of
-what changes with the view tells them apart before normals and light are known.
+Paint explains photos of a rough or embossed metal about as well as metal does. Training starts near paint, so it would stay there. The tint
+of a surfel's change with the view tells metal from paint before normals and light are known.
 
-Where nearly all of the surface shines as coloured metals do, metallic no longer learns: photos alone would turn some of it into paint
-again, since roughness, light and base colour explain rough metal and paint about as well.
+Where nearly all of the surface shines as coloured metals do, metallic no longer learns. Photos alone would turn some of it back into paint,
+because roughness, light and base colour explain rough metal and paint about as well.
 """
 
 import torch
@@ -18,15 +18,15 @@ from refgs.train.part import Part
 from refgs.train.state import State
 from refgs.train.timeline import Step, metals_decidable
 
-GIVEN = Kinds(metal=0.9, paint=0.02)  # metallic; training can still change it
-CERTAIN = 0.85  # part of the surface that shines as coloured metals do, above which all is metal; a gold cape has 0.95, matte clay 0.71
-MOSTLY = 0.6  # part of what is coloured that shines, above which what is dark may be metal, too; a bronze head has 0.69, a car 0.14
-TELLING = (
-    0.3  # part of the surface that is coloured, below which it tells nothing about the rest; a bronze head has 0.48
-)
-TOLD = 0.005  # part of the surface, above which a change is announced
-DOUBTFUL = 0.5  # doubt from which on photos do not tell
-HELD = Kinds(metal=0.98, paint=0.002)  # metallic that stays, in the order of `hints.KINDS`
+GIVEN = Kinds(metal=0.9, paint=0.02)  # metallic that is set first; training can still change it
+# All is metal if a larger fraction of the surface shines as coloured metals do; a gold cape has 0.95, matte clay 0.71.
+CERTAIN = 0.85
+# Dark parts may be metal if a larger fraction of the coloured surface shines; a bronze head has 0.69, a car 0.14.
+MOSTLY = 0.6
+TELLING = 0.3  # fraction of the surface that must be coloured to tell about the rest; a bronze head has 0.48
+TOLD = 0.005  # a change of a larger fraction of the surface is announced
+DOUBTFUL = 0.5  # photos do not tell metal from paint if doubt is at least this
+HELD = Kinds(metal=0.98, paint=0.002)  # metallic that does not learn, in the order of `hints.KINDS`
 
 
 class Metals(Part):
@@ -45,15 +45,20 @@ class Metals(Part):
 def find_metals(state: State, step: Step) -> None:
     """Once, early in the training, raise the metallic of the surfels that change with the view as only metals do.
 
-    See `shines_as_metal` for coloured metals, `falls_as_metal` for all. If a light that changed from photo to photo explains the changes
-    far better than mirroring does (see `changing_light.explained`), none is metal. If neither explains those of coloured surfels, nothing
-    that has a colour is metal: fur hides and shows what is below it, which has its colour. The metallic learned so far is then lowered.
+    `shines_as_metal` finds coloured metals, and `falls_as_metal` finds metals of any colour. Two findings rule metal out, and lower the
+    metallic that was learned so far:
 
-    If nearly all shine as coloured metals do, all are metal from then on (see `hold`), even if they do so faintly, as long as mirroring
-    explains that. Otherwise the others keep the metallic that they have learned: it started low, as that of a dielectric. If most of what
-    is coloured enough to tell shines, what is dark may be metal as well, such as patina: then `loss.dark` ends.
+    - A light that changed from photo to photo explains the changes far better than mirroring does (see `changing_light.explained`). Then
+      nothing is metal.
+    - Neither explains the changes of coloured surfels. Then nothing coloured is metal. Fur is an example: it hides and shows what is
+      below it, which has the same colour.
 
-    Schedules that propagate normals find metals by that, as the paper does: nothing is set there.
+    If nearly all surfels shine as coloured metals do, all are metal from then on (see `hold`). They may also shine faintly, as long as
+    mirroring explains that. Otherwise, the other surfels keep their metallic. It started low, as that of a dielectric.
+
+    If most of the coloured surface shines, dark parts may be metal as well, such as patina. Then the loss term `loss.dark` ends.
+
+    Schedules that propagate normals find metals by that, as the paper does. Nothing is set for them.
     """
     if state.part(Metals).found:
         return
@@ -90,9 +95,10 @@ def find_metals(state: State, step: Step) -> None:
 def judge(state: State, step: Step) -> None:
     """Judge again which surfels are metal, by what they mirror (see `mirrored`, `same_material`).
 
-    A surfel that is taken for paint but is of a piece with metals becomes metal, with their base colour and roughness: it mirrors evenly,
-    such as the lower half of a ball on a table, and has learned the mirrored table as its own colour. A metal that looks the same from
-    everywhere, where it would mirror changes, becomes paint. Training can still change both.
+    A surfel that is taken for paint becomes metal if it belongs to the same piece as metals do. It takes their base colour and roughness.
+    An example is the lower half of a ball on a table: it mirrors evenly, so it has learned the mirrored table as its own colour.
+
+    A metal becomes paint if it looks the same from everywhere, although what it would mirror changes. Training can still change both.
     """
     if not state.part(Metals).found:
         return
@@ -118,9 +124,9 @@ def judge(state: State, step: Step) -> None:
 def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
     """Measure where photos do not tell metal from paint (see `same_material.doubt`), and announce on how much of the surface.
 
-    Returns the doubt of each surfel (N,) in 0..1, and facts for metrics.json: `part`, the part of the surface with at least DOUBTFUL, 0..1,
-    and `what`, the words that are announced, if that is more than TOLD. Returns None where photos do not decide what is metal: without a
-    light, without specular shading, or without a mask of each photo. Surfels whose metallic is held are not in doubt.
+    Returns the doubt of each surfel (N,) in 0..1, and facts for metrics.json. `part` is the fraction of the surface whose doubt is at least
+    DOUBTFUL. `what` is the text that is announced if that fraction is more than TOLD. Returns None where photos do not decide what is
+    metal: without a light, without specular shading, or without a mask of each photo. Surfels whose metallic is held are not in doubt.
     """
     if not state.from_hull or not metals_decidable(state, state.iteration):
         return None
@@ -139,7 +145,7 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
 
 @torch.no_grad()
 def hold_as(state: State, kinds: torch.Tensor) -> None:
-    """Hold the metallic of surfels from now on (see `hold`). `kinds` (N,) has their index in `hints.KINDS`, −1 for those that learn."""
+    """Hold the metallic of surfels from now on (see `hold`). `kinds` (N,) has their index in `hints.KINDS`, or −1 for those that learn."""
     for number in range(len(HELD)):
         state.learned["metallic"][kinds == number] = raw_metallic(HELD[number])
     state.learned["held"].copy_(kinds >= 0)
@@ -148,7 +154,7 @@ def hold_as(state: State, kinds: torch.Tensor) -> None:
 
 
 def hold(state: State) -> None:
-    """Remove the gradient of the metallic of surfels that are held, so that it stays: `held` (N,) is true for them."""
+    """Remove the gradient of the metallic of surfels where `held` (N,) is true, so that it stays."""
     metallic = state.learned.get("metallic")
     if metallic is not None and metallic.grad is not None:
         metallic.grad.masked_fill_(state.learned["held"], 0)

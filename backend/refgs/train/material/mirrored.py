@@ -1,8 +1,8 @@
 """Compare what photos show of each surfel with what it would show as a metal, and as paint, under the light learned so far.
 
 A metal shows what it mirrors, times its reflectance. Paint shows its diffuse radiance, the same in all photos, and a twenty-fifth of what
-it mirrors. Both are fitted to some photos by least squares. What a surfel mirrors is the light or, where its mirror ray meets the object,
-the mean radiance that photos show there: so no material has to be known.
+it mirrors. Both are fitted to some photos by least squares. A surfel mirrors the light or, where its mirror ray meets the object, the mean
+radiance that photos show there. So no material has to be known.
 """
 
 from collections.abc import Iterable, Iterator
@@ -22,10 +22,10 @@ from refgs.train import probe
 from refgs.train.material.observe import GRAZING, NEIGHBOURS, OBSERVED_VIEWS, Seen, neighbours, observe_mirrored, pooled
 from refgs.train.state import State
 
-ROUGHNESSES = 0.05, 0.2, 0.45  # that are tried
-TOLERANCE = 0.15  # of the radiance: smaller errors of either kind tell nothing
-ENOUGH_PIXELS = 30.0  # pixels of the neighbours in all photos, at least
-BRIGHTEST = 20.0  # radiance of a mirrored lamp, at the most: photos clip it
+ROUGHNESSES = 0.05, 0.2, 0.45  # roughnesses that are tried
+TOLERANCE = 0.15  # fraction of the radiance: smaller errors of either kind tell nothing
+ENOUGH_PIXELS = 30.0  # least sum of the neighbours' pixels in all photos
+BRIGHTEST = 20.0  # largest radiance of a mirrored lamp: photos clip it
 
 
 class Fit(NamedTuple):
@@ -33,7 +33,7 @@ class Fit(NamedTuple):
 
     - `ratio` (N,): the squared error as a metal, divided by that as paint
     - `slope` (N,): how much the radiance changes with what is mirrored, from photo to photo
-    - `reflectance` (N, 3), `roughness` (N,): of the metal that fits best
+    - `reflectance` (N, 3), `roughness` (N,): those of the metal that fits best
     - `seen` (N,): whether photos show enough of it
     """
 
@@ -91,8 +91,8 @@ def _at_vertices(surfels: Surfels, seen: Seen, mesh: Mesh) -> Tensor:
 def _fit(seen: Seen, mirrored: Iterable[list[Tensor]], positions: Tensor) -> Fit:
     """Fit both materials to all photos, for each of ROUGHNESSES, and keep the best of each kind.
 
-    With reflectance s and diffuse radiance c, a metal shows (s FG0 + FG1) R and paint c + F R of what it mirrors, R: FG0, FG1 and F are the
-    entries 0, 1 and 3 of `brdf.reflectance_table`. Sums over photos suffice for both.
+    Let R be what a surfel mirrors. A metal of reflectance s shows (s FG0 + FG1) R. Paint of diffuse radiance c shows c + F R. FG0, FG1 and
+    F are the entries 0, 1 and 3 of `brdf.reflectance_table`. Sums over photos suffice to fit both.
     """
     near, count = neighbours(positions, NEIGHBOURS), len(positions)
     sums = {
@@ -101,7 +101,7 @@ def _fit(seen: Seen, mirrored: Iterable[list[Tensor]], positions: Tensor) -> Fit
     }
     changes = torch.zeros(
         count, 4, dtype=torch.double
-    )  # weighted sums of the mirrored, the shown, their product and the mirrored's square
+    )  # weighted sums: mirrored, shown, their product, the square of the mirrored
     for view, lights in enumerate(mirrored):
         shown, weight = seen.radiance[:, view], seen.weight[:, view, None].double()
         cosine = (seen.normal[:, view] * seen.towards[:, view]).sum(dim=1).clamp(GRAZING, 1)

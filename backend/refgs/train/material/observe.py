@@ -1,4 +1,4 @@
-"""Look at what the photos show of each surfel: how its radiance changes from photo to photo, and the normals that are blended there."""
+"""Observe each surfel in the photos: how its radiance changes from photo to photo, and which normals are blended at its pixels."""
 
 from typing import NamedTuple
 
@@ -17,14 +17,16 @@ from refgs.train.state import RenderInputs, State
 
 OBSERVED_VIEWS = 24  # photos that are looked at, at the most
 SWEEPS = 2  # steps in which surfels' radiance is fitted to the photos
-OVERSHOOT = 1.5  # of the later steps: surfels share pixels, so that plain steps are too short
-FACING = 0.4  # least cosine between a surfel's normal and the camera; nearer to grazing even matte surfaces change, by Fresnel
-LEAST_PIXELS = 0.5  # of a surfel in a photo; a smaller part of it tells more of its neighbours
-LEAST_VIEWS = 6  # of a surfel
-LEAST_CLIPPED = 0.05  # of a surfel's pixels in a photo; then its highlights look whiter than they are
-DARK = 0.03  # linear radiance below which a surfel does not count for a photo's exposure
-NEIGHBOURS = 64  # surfels whose changes are pooled, as one alone has too few photos
-GRAZING = 0.15  # least cosine between normal and camera: nearer to grazing, normals are not good enough
+OVERSHOOT = 1.5  # factor on the later steps: surfels share pixels, so that plain steps are too short
+# Least cosine between a surfel's normal and the camera; at more grazing angles, even matte surfaces change, by Fresnel.
+FACING = 0.4
+LEAST_PIXELS = 0.5  # pixels that a surfel must have in a photo; fewer tell more about its neighbours
+LEAST_VIEWS = 6  # photos that must show a surfel
+# Fraction of a surfel's pixels; if more are clipped in a photo, highlights look whiter there than they are.
+LEAST_CLIPPED = 0.05
+DARK = 0.03  # linear radiance; darker surfels do not count for a photo's exposure
+NEIGHBOURS = 64  # surfels whose changes are averaged, because too few photos show a single one
+GRAZING = 0.15  # least cosine between normal and camera; at more grazing angles, normals are not good enough
 
 
 class Kinds(NamedTuple):
@@ -54,7 +56,7 @@ class Observations(NamedTuple):
 
     @property
     def usable(self) -> Tensor:
-        """Tell which photos of which surfels count (N, V): none of a surfel that too few photos show."""
+        """Tell which photos count for which surfels (N, V). None counts for a surfel that too few photos show."""
         shown = self.pixels > LEAST_PIXELS
         return shown & (shown.sum(dim=1, keepdim=True) >= LEAST_VIEWS)
 
@@ -79,7 +81,7 @@ class Seen(NamedTuple):
 
     @property
     def outward(self) -> Tensor:
-        """Return one unit normal (N, 3) of each surfel, towards the cameras that see it."""
+        """Return one unit normal for each surfel (N, 3). It points towards the cameras that see the surfel."""
         return torch.nn.functional.normalize((self.normal * self.weight[..., None]).sum(dim=1), dim=1)
 
 
@@ -87,9 +89,11 @@ class Seen(NamedTuple):
 def observe_changes(state: State) -> Observations:
     """Compare some training photos with a model in which each surfel looks the same from everywhere.
 
-    The model's radiance is fitted to the photos, with an exposure for each photo. If the light turns with the camera, the diffuse light on
-    a matte surface changes from photo to photo, too: then the model also has spherical harmonics of degree 2 of the normal in the camera's
-    frame, as irradiance has (Ramamoorthi and Hanrahan 2001). What occludes a surfel, and what it shares pixels with, is part of the model.
+    The model's radiance is fitted to the photos, with an exposure for each photo. The model includes occlusion, and pixels that surfels
+    share.
+
+    If the light turns with the camera, the diffuse light on a matte surface changes from photo to photo, too. The model then also has
+    spherical harmonics of degree 2 of the normal in the camera's frame, as irradiance has (Ramamoorthi and Hanrahan 2001).
     """
     surfels = Surfels(*(value.detach() for value in state.surfels()))
     photos = [state.photo(view) for view in probe.spread_views(state, OBSERVED_VIEWS)]
@@ -102,7 +106,7 @@ def observe_changes(state: State) -> Observations:
         facing, towards = (torch.einsum("vij,nvj->nvi", torch.stack(turns), each) for each in (facing, towards))
         light = harmonics.basis(facing.flatten(0, 1), 2).unflatten(0, facing.shape[:2])
     mean = torch.zeros_like(normals)
-    factor = torch.ones_like(cosines)  # of the mean in a photo: its exposure and its diffuse light
+    factor = torch.ones_like(cosines)  # factor on the mean in each photo: its exposure and its diffuse light
     for sweep in range(SWEEPS):
         totals, pixels, _ = _residuals(surfels, photos, mean, factor, state.near)
         step = (totals.sum(dim=1) / pixels.sum(dim=1).clamp_min(1e-6)[:, None]) * (OVERSHOOT if sweep else 1.0)
@@ -117,7 +121,7 @@ def observe_changes(state: State) -> Observations:
 
 @torch.no_grad()
 def observe_mirrored(state: State, inputs: RenderInputs, views: list[int]) -> Seen:
-    """Look at the surfels of `inputs` in some training views, without the photos' exposures, and at the normals blended there."""
+    """Observe the surfels of `inputs` in some training views, without the photos' exposures, and the normals blended there."""
     sums = [_sums(state, inputs, view) for view in views]
     radiance, pixels, clipped, normal = torch.stack(sums, dim=1).cpu().split([3, 1, 1, 3], dim=2)
     towards = _towards(inputs.surfels, [state.photo(view) for view in views]).cpu()
@@ -129,7 +133,7 @@ def observe_mirrored(state: State, inputs: RenderInputs, views: list[int]) -> Se
 
 
 def _sums(state: State, inputs: RenderInputs, view: int) -> Tensor:
-    """Sum over each surfel's pixels in a photo (N, 8): linear radiance, weights, those of clipped pixels, and blended normals."""
+    """Sum over each surfel's pixels in a photo (N, 8): linear radiance, weights, weights of clipped pixels, and blended normals."""
     photo, factor = state.photo(view), exposure(state, view)
     radiance = _linear(photo)
     radiance = radiance if factor is None else radiance / factor
@@ -159,13 +163,13 @@ def _clipped(photo: Photo) -> Tensor:
 def _residuals(
     surfels: Surfels, photos: list[Photo], mean: Tensor, factor: Tensor, near: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Sum what the photos show beyond the model over each surfel's pixels, with its blending weights.
+    """Sum the photos' differences from the model over each surfel's pixels, weighted by its blending weights.
 
-    Returns the sums (N, V, 3), the sums of the weights (N, V), and those of clipped pixels (N, V).
+    Returns the sums (N, V, 3), the sums of the weights (N, V), and the sums of the weights of clipped pixels (N, V).
     """
     sums = []
     for number, photo in enumerate(photos):
-        # Decoded anew each time: as floats, all photos together would take five times their memory.
+        # Decode each photo anew: as floats, all together would take five times their memory.
         target, lost = _linear(photo), _clipped(photo)
         features = torch.cat([mean * factor[:, number, None], torch.ones_like(mean[:, :2])], dim=1)
 
@@ -181,7 +185,7 @@ def _fitted(factor: Tensor, totals: Tensor, pixels: Tensor, mean: Tensor, light:
     """Fit the factor of each surfel in each photo (N, V) to the residuals.
 
     `light` (N, V, 9) are harmonics of the diffuse light. Without it, a factor depends on the photo alone. A photo's factor is a median,
-    which highlights hardly move.
+    because highlights hardly move a median.
     """
     brightness = mean.mean(dim=1)
     known = (pixels > LEAST_PIXELS) & (brightness > DARK)[:, None]
@@ -197,7 +201,7 @@ def _fitted(factor: Tensor, totals: Tensor, pixels: Tensor, mean: Tensor, light:
 
 
 def from_grey(colour: Tensor) -> Tensor:
-    """Return how far the chromaticities of linear colours (N, 3) are from grey's (N, 3)."""
+    """Return the differences (N, 3) of the chromaticities of linear colours (N, 3) from that of grey."""
     return colour / colour.sum(dim=1, keepdim=True).clamp_min(1e-6) - 1 / 3
 
 
@@ -219,7 +223,7 @@ def averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, 
 def neighbours(positions: Tensor, most: int, of: Tensor | None = None) -> Tensor:
     """Return the indices (M, K) of each surfel's nearest surfels, itself among them: K is `most`, or N if there are fewer.
 
-    The mask `of` (N,) chooses whose are returned; all surfels' if it is None.
+    The mask `of` (N,) selects the surfels whose neighbours are returned. None selects all.
     """
     points = positions.numpy(force=True)
     chosen = points if of is None else positions[of].numpy(force=True)

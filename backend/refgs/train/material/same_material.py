@@ -1,7 +1,7 @@
-"""Decide between metal and paint for whole surfaces: what photos tell of some surfels spreads to those that are of the same piece.
+"""Decide between metal and paint for whole surfaces: evidence about some surfels spreads to others of the same piece.
 
 The model is a random walk with seeds (Grady 2006) on a graph of neighbouring surfels. Steps are likely along a smooth surface of one
-brightness. They are unlikely across a concave crease, where two objects touch, or two parts.
+brightness. They are unlikely across a concave crease, where two objects or two parts touch.
 """
 
 from typing import NamedTuple
@@ -16,34 +16,36 @@ from refgs.model.surfels import Surfels
 from refgs.train.material.mirrored import Fit
 from refgs.train.material.observe import Kinds, Seen, neighbours
 
-# Of a surfel's error as a metal, in parts of its error as paint: it is a metal below RATIO.metal, if what it mirrors shows by SLOPE and if
-# it reflects REFLECTANCE, and paint above RATIO.paint. Painted plastic reaches a reflectance of 0.3, most metals have more than 0.4.
+# Limits of a surfel's error as a metal, divided by its error as paint. The surfel is a metal below RATIO.metal, if its radiance changes
+# with what it mirrors by at least SLOPE, and its reflectance is at least REFLECTANCE. It is paint above RATIO.paint. Painted plastic
+# reaches a reflectance of 0.3, most metals have more than 0.4.
 RATIO = Kinds(metal=0.6, paint=2.5)
 SLOPE, REFLECTANCE = 0.12, 0.35
-SURE = 1.5  # logarithm of that ratio, above which evidence does not count more
-# Weight of what tells paint, where it is to keep paint: a metal whose shape is wrong looks like paint.
+SURE = 1.5  # evidence does not count more beyond this logarithm of that ratio
+# Weight of evidence for paint when paint may become metal: a metal whose shape is wrong looks like paint.
 AGAINST_METAL = 0.5
-SO_FAR = Kinds(metal=0.15, paint=0.045)  # weight of the kind so far
-# How likely a metal is, above which paint becomes metal, and below which metal becomes paint.
+SO_FAR = Kinds(metal=0.15, paint=0.045)  # weight of the kind that training has found so far
+# Probabilities of metal: above the first, paint becomes metal, and below the second, metal becomes paint.
 LIKELY, UNLIKELY = 0.5, 0.2
-OPEN = 0.02 * SURE  # weight with which `doubt` takes a surfel for neither
-FITTED = 0.01  # weight of a metal that was only fitted, beside one that was learned
-# How far evidence spreads: the weight of differences between neighbours. It grows with the number of surfels, so that evidence spreads as
-# far over a surface however densely surfels lie on it, and is at least what few surfels need.
+OPEN = 0.02 * SURE  # weight with which `doubt` draws a surfel towards neither kind
+FITTED = 0.01  # weight of a metal's material if it is only fitted, relative to a learned one
+# Weight of differences between neighbours: it decides how far evidence spreads. It grows with the number of surfels, so that evidence
+# spreads as far over a surface however densely surfels cover it. Few surfels need LEAST_REACH.
 REACH, LEAST_REACH = 3.75e-4, 3.0
 LINKED = 16
-BENT, CREASED = 0.35, 0.12  # radians between neighbours' normals that convex and concave surfaces have at the most
-STEP = 0.5  # sine by which a neighbour may lie off the surfel's plane
-SHADE = 1.0  # logarithm by which the neighbours' mean radiance may differ
-FRINGE = 1.0  # pixels in all photos, below which a surfel takes no part
-CG_TOLERANCE, CG_STEPS = 1e-3, 200  # of conjugate gradients
+# Largest angles, in radians, between neighbours' normals on convex and on concave surfaces.
+BENT, CREASED = 0.35, 0.12
+STEP = 0.5  # largest sine of the angle at which a neighbour lies off the surfel's plane
+SHADE = 1.0  # largest difference of the logarithms of the neighbours' mean radiances
+FRINGE = 1.0  # surfels with fewer pixels in all photos take no part
+CG_TOLERANCE, CG_STEPS = 1e-3, 200  # tolerance and most steps of conjugate gradients
 
 
 class Found(NamedTuple):
     """Hold the decision for N surfels.
 
-    - `metal`, `paint` (N,): bool, which of those that were taken for the other kind are metals, and which are paint
-    - `like_metals` (N, 4): base colour and roughness of the metals that each is connected to
+    - `metal`, `paint` (N,): bool, the surfels taken for paint that are metals, and the surfels taken for metals that are paint
+    - `like_metals` (N, 4): base colour and roughness of the metals to which each surfel is connected
     """
 
     metal: Tensor
@@ -52,9 +54,10 @@ class Found(NamedTuple):
 
 
 def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
-    """Decide which surfels are taken for the wrong kind, from what photos tell (see `material.mirrored`) and from their neighbours.
+    """Decide which surfels are taken for the wrong kind, by what photos tell (see `material.mirrored`) and by their neighbours.
 
-    Evidence for either kind spreads over a surface. The kind that training has found so far stays where there is none. It does not spread.
+    Evidence for either kind spreads over a surface. Where there is none, surfels keep the kind that training has found so far. That kind
+    does not spread.
     """
     graph, part, metal, paint = _evidence(surfels, seen, fit)
     was, none = (surfels.metallic > 0.5).numpy(), 1e-4
@@ -66,7 +69,7 @@ def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
         torch.cat([colour, rough[:, None]], dim=1).double().numpy()
         for colour, rough in ((surfels.albedo, surfels.roughness), (fit.reflectance, fit.roughness))
     )
-    # What others have learned as paint is the colour of what they mirror, so they have what was fitted.
+    # Surfels that were paint so far have learned the colour of what they mirror, so their fitted material is used.
     material = np.where(was[:, None], learned, fitted)
     mean = (material * sure[:, None]).sum(axis=0) / max(sure.sum(), 1e-9)
     like = [_solve(graph, sure + none, sure * of + none * all_of) for of, all_of in zip(material.T, mean, strict=True)]
@@ -75,20 +78,20 @@ def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
 
 
 def doubt(surfels: Surfels, seen: Seen, fit: Fit) -> Tensor:
-    """Measure where photos do not tell metal from paint, whatever the training has made of it: (N,) in 0..1.
+    """Measure where photos do not tell metal from paint, whatever the training has decided: (N,) in 0..1.
 
-    0 is a surfel that photos tell. 1 is one that hardly any pixel shows, or of whose piece photos tell nothing. Between them, doubt rises
-    with the distance from surfels of the same piece that photos tell.
+    Doubt is 0 where photos tell. It is 1 where hardly any pixel shows the surfel, or where photos tell nothing about its piece. Between
+    them, it rises with the distance from surfels of the same piece about which photos tell.
 
-    With p, how likely a metal is, doubt is 1 − |2 p − 1|. 2 p − 1 solves the system of `decide` for metals at 1 and paint at −1. All are
-    drawn to 0, by the weight OPEN in place of that of the material so far.
+    Let p be the probability of metal. Doubt is 1 − |2 p − 1|. The value 2 p − 1 solves the system of `decide`, with metals at 1 and paint
+    at −1. All surfels are drawn to 0 with the weight OPEN, instead of to their kind so far.
     """
     graph, _, metal, paint = _evidence(surfels, seen, fit)
     return 1 - torch.from_numpy(_solve(graph, metal + paint + OPEN, metal - paint)).float().abs().clamp_max(1)
 
 
 def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the graph of surfels (N, N), which of them take part (N,), and how much photos tell that each is metal, and paint (N,)."""
+    """Return the graph of surfels (N, N), which of them take part (N,), and the evidence for metal (N,) and for paint (N,)."""
     graph, part = _laplacian(surfels.positions, seen), (seen.pixels > FRINGE).double().numpy()
     ratio = np.asarray((fit.ratio.clamp(1e-3, 1e3).log().double() * fit.seen).numpy())
     mirrors = (fit.slope > SLOPE) & (fit.reflectance.amax(dim=1) > REFLECTANCE)
