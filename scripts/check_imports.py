@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 # The trainer's floors, the lowest first. A module may import its own floor and those below. CONTRIBUTING.md describes each floor.
 FLOORS = (
-    ("", "asked", "camera", "clock", "color", "errors", "events", "memory", "paths", "settings"),
+    ("", "asked", "camera", "clock", "color", "effective", "errors", "events", "memory", "paths", "settings"),
     ("formats",),
     ("kernels",),
     ("model",),
@@ -36,9 +36,9 @@ FLOORS = (
 )
 # The same inside the package `train`, whose rooms stand on floors of their own.
 ROOMS = (
-    ("", "effective", "photo", "plan", "start"),
+    ("", "photo", "plan", "start"),
     ("state",),
-    ("part", "screen_gradient", "timeline"),
+    ("part", "timeline"),
     ("learn",),
     ("probe",),
     ("material",),

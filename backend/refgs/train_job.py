@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from refgs.asked import Asked
+from refgs.effective import Effective
 from refgs.errors import InputError, TryAgain
 from refgs.events import Report
 from refgs.formats.run_toml import Trained
@@ -31,7 +32,6 @@ from refgs.run_folder import (
     update_metrics,
 )
 from refgs.settings import Settings
-from refgs.train.effective import Effective
 from refgs.train.plan import Plan
 
 if TYPE_CHECKING:

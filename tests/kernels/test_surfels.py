@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from refgs.model.surfels import activate, initial_parameters
+from refgs.render.screen_gradient import ScreenGradient
 from refgs.render.stack import stack
-from refgs.train.screen_gradient import ScreenGradient
 from tests.makers import scenes
 
 COUNT = 5003

@@ -5,9 +5,9 @@ import torch
 from refgs.camera import Camera
 from refgs.model.learned import Learned
 from refgs.model.surfels import activate, initial_parameters
+from refgs.render.screen_gradient import ScreenGradient
 from refgs.settings import load_settings
 from refgs.train.learn.densify import densify
-from refgs.train.screen_gradient import ScreenGradient
 
 SETTINGS = load_settings("quick").densify
 

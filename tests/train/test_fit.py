@@ -9,8 +9,8 @@ import pytest
 from refgs import train_job
 from refgs.asked import Asked
 from refgs.capture import read_capture
+from refgs.effective import Effective
 from refgs.settings import load_settings
-from refgs.train.effective import Effective
 from refgs.train.fit import FASTEST, REHEARSED, _scheduled, between, fitting
 from refgs.train.plan import Plan
 

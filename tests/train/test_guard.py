@@ -15,12 +15,12 @@ from refgs.model.learned import Learned
 from refgs.render.baselines import LINEAR, SCREEN
 from refgs.render.directional import directional
 from refgs.render.rasterize import rasterize
+from refgs.render.screen_gradient import ScreenGradient
 from refgs.render.shade import shade
 from refgs.settings import load_settings
 from refgs.train.keep.progress import running
 from refgs.train.learn.densify import Densification
 from refgs.train.learn.guard import MOST_IN_A_ROW, Guard, remove_broken
-from refgs.train.screen_gradient import ScreenGradient
 from refgs.train.timeline import faint
 from tests.makers import scenes
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from refgs.capture import read_capture
+from refgs.effective import Effective
 from refgs.settings import load_settings
-from refgs.train.effective import Effective
 from refgs.train.plan import Plan
 from refgs.train.setup import set_up
 from tests.makers.distances import around

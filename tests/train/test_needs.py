@@ -19,6 +19,7 @@ from benchmarks.scenes.analytic import write_ball_capture
 from refgs.formats.needs import Found
 from refgs.formats.splats import read_splats
 from refgs.model.environment import Environment
+from refgs.render.sums import blended_shares
 from refgs.run import open_run
 from refgs.train import probe
 from refgs.train.decide import iterations, lighting, needs, photos
@@ -377,7 +378,7 @@ def test_texels_by_the_lobe():
         assert lighting.resolvable(roughness, lobe, 256, 16) == side
         assert side in (16, 256) or math.pi / 2 / side <= lobe * roughness**2 < math.pi / side
     light = Environment(torch.rand(6 * 32**2, 3))
-    coarse = probe.pooled(light, 16)
+    coarse = light.reduced(16)
     assert coarse.resolution == 16
     torch.testing.assert_close(coarse.radiance.mean(dim=0), light.radiance.mean(dim=0))
 
@@ -449,9 +450,8 @@ def test_what_a_small_part_loses_is_told_apart(ball_capture, tmp_path, mask):
     made = trainer(ball_capture, tmp_path / "run", total=10)
     state = made.state
     put(made, albedo=-3.0, opacity=4.0)
-    shares = probe.blended_shares(
-        state.surfels(), [state.photo(view) for view in probe.spread_views(state)], state.near
-    )
+    cameras = [state.photo(view).camera for view in probe.spread_views(state)]
+    shares = blended_shares(state.surfels(), cameras, state.near)
     seen = shares.sum(dim=0)
     nearest = (state.learned["position"] - state.learned["position"][seen.argmax()]).norm(dim=1).argsort()
     patch = nearest[: 1 + int((seen[nearest].cumsum(dim=0) < 0.008 * seen.sum()).sum())]
@@ -494,10 +494,10 @@ def test_shares_are_weights(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", total=10)
     photo, surfels = made.state.photo(0), made.state.surfels()
     alpha = made.state.render(photo.camera).alpha
-    shares = probe.blended_shares(surfels, [photo], made.state.near)
+    shares = blended_shares(surfels, [photo.camera], made.state.near)
     torch.testing.assert_close(shares.sum(), alpha.sum(), rtol=1e-3, atol=0)
     even = torch.full((*alpha.shape, 2), 0.3)
-    mean = probe.blended_shares(surfels, [photo], made.state.near, [even])
+    mean = blended_shares(surfels, [photo.camera], made.state.near, [even])
     seen = shares[0] > 1e-3
     torch.testing.assert_close(mean[seen], torch.full_like(mean[seen], 0.3), rtol=1e-3, atol=0)
 

@@ -11,12 +11,13 @@ from benchmarks.scenes.analytic import TWO, camera_matrix, photo, write_ball_cap
 from refgs import commands, train_job
 from refgs.asked import Asked
 from refgs.capture import read_capture
+from refgs.capture.first_points import AROUND
 from refgs.errors import InputError
 from refgs.formats.gltf import read_glb
 from refgs.formats.splats import read_splats
 from refgs.run import open_run
 from refgs.train.keep.live_view import write_preview
-from refgs.train.start import AROUND, start_parameters
+from refgs.train.start import start_parameters
 from tests.makers.training import SMALL, trainer
 
 CHANGES = [*SMALL, "surfels.hull=48", "train.iterations=150", "mesh.resolution=48"]

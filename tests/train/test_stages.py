@@ -11,9 +11,10 @@ from refgs.camera import Camera
 from refgs.model import cubemap
 from refgs.model.environment import Environment
 from refgs.model.surfels import activate, initial_parameters
+from refgs.render.mirrored_light import mirrored_light
 from refgs.settings import load_settings
 from refgs.train.keep.measures import held_out_psnr
-from refgs.train.learn.light import diffuse, mirrored
+from refgs.train.learn.light import diffuse
 from refgs.train.learn.rates import set_rates
 from refgs.train.setup import start_deferred
 from refgs.train.start import GEOMETRY
@@ -147,7 +148,7 @@ def test_the_mean_light_counts_each_pixel_alike():
     camera = Camera("above", 64, 64, 64.0, 64.0, 32.0, 32.0, from_above)
     ones = Environment(torch.ones(6 * 16**2, 3))
     with torch.no_grad():
-        weights = mirrored(surfels, [camera], ones, load_settings("quick").render, 0.01)
+        weights = mirrored_light(surfels, [camera], ones, load_settings("quick").render, 0.01)
     directions = cubemap.texel_directions(16).float()
     towards = torch.from_numpy(
         2 * tilted[2] * tilted - [0, 0, 1]

@@ -6,6 +6,7 @@ y). Only this program reads these cubemaps, so they need not follow the conventi
 """
 
 import itertools
+import math
 from functools import lru_cache
 
 import torch
@@ -163,6 +164,12 @@ def _bilinear(face: Tensor, s: Tensor, t: Tensor, level: Tensor, sides: tuple[in
     corners = torch.stack([corner, corner + 1, corner + width, corner + width + 1], dim=-1)
     gx, gy = 1 - fx, 1 - fy
     return table[corners], torch.stack([gx * gy, fx * gy, gx * fy, fx * fy], dim=-1)
+
+
+def reduced(texels: Tensor, side: int) -> Tensor:
+    """Reduce a cubemap's texels (6·R², C) to `side` texels along a side (6·side², C), by averaging."""
+    fine = math.isqrt(len(texels) // 6) // side
+    return texels.reshape(6, side, fine, side, fine, -1).mean(dim=(2, 4)).reshape(6 * side * side, -1)
 
 
 def sample(levels: Tensor, sides: tuple[int, ...], directions: Tensor, level: Tensor) -> Tensor:

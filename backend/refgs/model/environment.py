@@ -47,6 +47,10 @@ class Environment:
         """Return the rotation (3, 3) that takes a world direction to the direction in which `radiance` is looked up, for this camera."""
         return np.eye(3) if self.reference is None else turn_between(camera, self.reference)
 
+    def reduced(self, side: int) -> "Environment":
+        """Return the light with a cubemap of `side` texels along a side."""
+        return Environment(cubemap.reduced(self.radiance, side), self.reference)
+
     def panorama(self, height: int) -> np.ndarray:
         """Convert the light to an equirectangular picture of radiance (height, 2·height, 3) in Blender's orientation."""
         directions = torch.from_numpy(panorama_directions(height, 2 * height)).reshape(-1, 3).float()

@@ -4,17 +4,16 @@ import math
 from pathlib import Path
 
 from refgs.capture import Capture
+from refgs.effective import Effective
 from refgs.events import Report
 from refgs.settings import RATES, Settings, validate
 from refgs.train.decide.object_size import object_size, surfel_budget
-from refgs.train.effective import Effective
 from refgs.train.learn import coarse
 from refgs.train.plan import BY_PIXELS, END, END_A_VIEW, FULL, OTHERS, Plan, growth, iterations_time
 from refgs.train.trainer import Trainer
 
 WARM, REHEARSED = 5, 25  # iterations between which the pace is measured
-# Settings that are scaled with the number of iterations.
-SCHEDULE = ("train", "light_first"), ("densify", "every"), ("indirect", "every")
+SCHEDULE = ("train", "light_first"), ("densify", "every"), ("indirect", "every")  # scaled with the iterations
 FASTEST = 2.0  # largest factor on a preset's learning rates
 RICHER_STEPS, RICHEST = 64, 2.0  # number of steps from `quick` (0) to the richest settings; `standard` is at 1
 
@@ -38,9 +37,8 @@ def fitting(
     for _ in range(REHEARSED):
         float(trainer.iterate()["loss"])  # reading the loss waits for the graphics card
         marks.append(plan.spent)
-    pace = (
-        (marks[-1] - marks[WARM - 1]) / (REHEARSED - WARM) / trainer.state.part(coarse.Coarse).stages[0].cost
-    )  # in iterations on full photos
+    cost = trainer.state.part(coarse.Coarse).stages[0].cost
+    pace = (marks[-1] - marks[WARM - 1]) / (REHEARSED - WARM) / cost  # seconds of an iteration on full photos
     views, first = len(capture.train_views) + len(capture.test_views), trainer.state.learned.count
     pixels, size = _pixels(capture, quick), object_size(trainer.state)
 

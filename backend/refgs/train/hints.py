@@ -21,10 +21,8 @@ from refgs.train.material import metals
 from refgs.train.start import start_appearance
 from refgs.train.state import State
 
-# Progress at which training starts again: surfels lie on the surface, and light and materials still learn fast.
-AGAIN = 0.4
-# Minutes, unless the user gives a time: an artist who clicks on a part waits two minutes, with the program's start.
-AT_MOST = 1.8
+AGAIN = 0.4  # progress to start from again: surfels lie on the surface, light and materials still learn fast
+AT_MOST = 1.8  # minutes, unless the user gives a time: with the program's start, an artist waits two
 # Hinted metals start bright and smooth: photos tell this kind of metal from paint least.
 MIRROR = {"albedo": 0.8, "roughness": 0.1}
 

@@ -9,8 +9,7 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.capture import LoadedView
 
-# Pixels around the mask; no D-SSIM window, whose radius is 5, then covers both the object and the crop's border.
-MARGIN = 10
+MARGIN = 10  # pixels around the mask; a D-SSIM window, whose radius is 5, never covers object and border
 
 Crop = tuple[slice, slice]
 """Rows and columns of a photo."""

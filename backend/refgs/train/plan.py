@@ -3,14 +3,12 @@
 import time
 from typing import NamedTuple
 
-# Time for writing the asset, in iterations: a time for each photo, because all are rendered, and a constant.
-END_A_VIEW, END = 0.5, 20
+END_A_VIEW, END = 0.5, 20  # time for writing the asset, in iterations: for each photo that is rendered, and in all
 # Iterations slow down as surfels are divided and inter-reflection starts. The slowdown is linear between these parts of a training.
 GROWS = 0.1, 0.3
 OTHERS = 16_000  # number of surfels that takes as long as the rest of an iteration
 BY_PIXELS = 0.8  # an iteration's time grows with the number of pixels to this power: 0.7 to 0.9 on three captures
-# Factor on an iteration's time for inter-reflection: 1 without, 1.4 if much of the object mirrors itself.
-MIRRORED = 1.2
+MIRRORED = 1.2  # factor on the time for inter-reflection: 1 without, 1.4 if much of the object mirrors itself
 
 
 class Stage(NamedTuple):

@@ -12,16 +12,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from refgs.model.environment import Environment
 from refgs.model.harmonics import DC
 from refgs.model.surfels import Surfels
 from refgs.render.rasterize import rasterize
 from refgs.render.rendering import COVERED, Rendering
+from refgs.render.sums import blended_shares
 from refgs.render.volume import discs
 from refgs.train.learn.coarse import cost
 from refgs.train.learn.exposures import exposure
 from refgs.train.learn.losses import objective
-from refgs.train.photo import Photo
 from refgs.train.state import RenderInputs, State, spread
 
 VIEWS = 8  # views that are looked at, at most
@@ -31,13 +30,6 @@ REPEATS = 2  # times that each kind of iteration is measured; the fastest counts
 
 Change = Callable[[RenderInputs], RenderInputs]
 """Function that leaves a part out of the inputs of a rendering."""
-
-
-def pooled(environment: Environment, side: int) -> Environment:
-    """Reduce the light's cubemap to `side` texels along a side by averaging texels."""
-    fine = environment.resolution // side
-    texels = environment.radiance.reshape(6, side, fine, side, fine, 3).mean(dim=(2, 4))
-    return Environment(texels.reshape(-1, 3), environment.reference)
 
 
 def without_specular(inputs: RenderInputs) -> RenderInputs:
@@ -147,42 +139,6 @@ def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: b
     return max(fastest[0] - fastest[1], 0.0) * max(cost(state, state.iteration, state.total), 0.0)
 
 
-def pixel_sums(
-    surfels: Surfels, photo: Photo, near: float, features: Tensor, weigh: Callable[[Tensor], Tensor]
-) -> Tensor:
-    """Sum an image over each surfel's pixels, weighted by the surfel's blending weights. Returns the sums (N, C).
-
-    The image (H, W, C) is made by `weigh` from the picture (H, W, C) of the surfels' `features` (N, C). The sums are computed as the
-    gradient of the features. Surfels nearer to the camera than `near` are not drawn.
-    """
-    features = features.detach().clone().requires_grad_()
-    with torch.enable_grad():
-        blended = rasterize(*discs(surfels, photo.camera), features, photo.camera, near=near).features
-        # A scalar: given a gradient argument, torch imports sympy (0.5 s).
-        return torch.autograd.grad((blended * weigh(blended.detach())).sum(), features)[0]
-
-
-@torch.no_grad()
-def blended_shares(
-    surfels: Surfels, photos: Iterable[Photo], near: float, maps: Iterable[Tensor] | None = None
-) -> Tensor:
-    """Compute how much each surfel contributes to each of V photos (V, N): the sum of its blending weights over all pixels.
-
-    If `maps` holds an image (H, W, C) for each photo, return instead the mean of these images for each surfel (N, C), weighted by its
-    blending weights. Surfels nearer to a camera than `near` are not drawn. Photos and maps may be generators: one of each is held.
-    """
-    surfels = Surfels(*(value.detach() for value in surfels))
-    one = torch.ones_like(surfels.positions[:, :1])
-    if maps is None:
-        return torch.stack([pixel_sums(surfels, photo, near, one, torch.ones_like)[:, 0] for photo in photos])
-    rows = []
-    for photo, values in zip(photos, maps, strict=True):
-        image = torch.cat([values, torch.ones_like(values[..., :1])], dim=-1)
-        rows.append(pixel_sums(surfels, photo, near, one.expand(-1, image.shape[-1]), lambda _, image=image: image))
-    total = torch.stack(rows).sum(dim=0)
-    return total[:, :-1] / total[:, -1:].clamp_min(1e-6)
-
-
 def mirrored_and_mean(state: State, inputs: RenderInputs, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
     """Render `views` twice, encoded (H, W, 3): with reflections, and with reflections that do not change with the view.
 
@@ -191,7 +147,7 @@ def mirrored_and_mean(state: State, inputs: RenderInputs, views: list[int]) -> I
     """
     dull = without_specular(inputs)
     over = (picture(state, view, inputs).radiance - picture(state, view, dull).radiance for view in views)
-    mean = blended_shares(inputs.surfels, (state.photo(view) for view in views), state.near, over)
+    mean = blended_shares(inputs.surfels, (state.photo(view).camera for view in views), state.near, over)
     for view in views:
         shown, base, camera = picture(state, view, inputs), picture(state, view, dull), state.photo(view).camera
         feature = rasterize(*discs(inputs.surfels, camera), mean, camera, near=state.near).features

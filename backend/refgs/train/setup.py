@@ -8,13 +8,13 @@ from pathlib import Path
 import torch
 
 from refgs.capture import Capture
+from refgs.capture.light_frame import light_frame
+from refgs.effective import Effective
 from refgs.events import Report
 from refgs.model.learned import Learned
 from refgs.model.surfels import Parameters, activate
 from refgs.train.decide import needs
-from refgs.train.decide.light_frame import light_frame
 from refgs.train.decide.object_size import limit_surfels, object_size
-from refgs.train.effective import Effective
 from refgs.train.keep.progress import Means
 from refgs.train.learn import coarse, light, priors
 from refgs.train.learn.coarse import Coarse

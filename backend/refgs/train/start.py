@@ -1,68 +1,48 @@
-"""Place the first surfels on the visual hull, on structure-from-motion points, or at random."""
+"""Make the parameters of the first surfels."""
 
 import math
-from functools import partial
 
 import numpy as np
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 
-from refgs.capture import Box, Capture, LoadedView
-from refgs.errors import InputError
-from refgs.geometry.hollows import carve_hollows
-from refgs.geometry.hull import visual_hull_points
-from refgs.geometry.stereo import Photo
+from refgs.capture import Capture, LoadedView
+from refgs.capture.first_points import FirstPoints, first_points
 from refgs.model.surfels import Parameters, initial_parameters
 from refgs.render.baselines import axes_of
 from refgs.settings import Settings, SurfelSettings
 
 GEOMETRY = ("position", "rotation", "scale", "opacity")
 FAINT = 0.1  # largest opacity of points that may not lie on the surface
-AROUND = 0.5  # largest fraction of the surfels that may lie outside the region
 
 
 def start_parameters(
     capture: Capture, views: list[LoadedView], settings: Settings, hollows: bool = False
 ) -> tuple[Parameters, int, str]:
-    """Make the initial parameters of the surfels.
+    """Make the initial parameters of the surfels, which start at the `first_points`.
 
-    Returns the parameters, the number of surfels on the visual hull, and a message for the user that says where the surfels start.
-
-    If all photos have masks, most surfels start on the visual hull of the masks. Their rows come first in the parameters. The other surfels
-    start inside the hull, because masks do not show hollows. With `hollows`, the hull is first carved where photos see through it. That
-    needs a light that stands still (see `hollows.carve_hollows`). If any photo has no mask, surfels start at structure-from-motion points
-    or at random positions. The returned number then has no meaning.
+    Returns the parameters, the number of surfels on the visual hull, and a message for the user that says where the surfels start. Those on
+    the hull come first. If there is no hull, their number has no meaning.
     """
-    count, seed = min(settings.surfels.start, settings.surfels.budget), settings.train.seed
-    colours, opacity, shown = None, settings.surfels.opacity, count
-    if all(view.alpha is not None for view in views):
-        positions, normals, spacing, shown = _hull_points(capture, views, count, settings, hollows)
-        source = "the visual hull of the masks" + (", less what photos see through" if hollows else "")
-    else:
-        opacity = min(opacity, FAINT)
-        if capture.points is not None and _enough(capture.points, capture.box):
-            positions, colours = _thinned(capture.points, capture, count, seed)
-            source = f"{len(positions)} structure-from-motion points"
-        else:
-            positions = _random_points(capture, count, seed)
-            source = "random points (no masks and no structure-from-motion points)"
-        normals, spacing = _towards_cameras(positions, views), _spacing(positions)
-    parameters = _initial(positions, normals, spacing, colours, settings.surfels, opacity)
+    points = first_points(capture, views, settings.surfels, settings.train.seed, hollows)
+    shown = len(points.positions) if points.on_hull is None else points.on_hull
+    opacity = settings.surfels.opacity
+    parameters = _initial(points, settings.surfels, min(opacity, FAINT) if points.on_hull is None else opacity)
     parameters["opacity"].data[shown:].clamp_(max=math.log(FAINT / (1 - FAINT)))
-    return parameters, shown, f"{len(positions)} surfels start on {source}"
+    return parameters, shown, f"{len(points.positions)} surfels start on {points.source}"
 
 
 def start_appearance(settings: Settings) -> Parameters:
     """Make the initial colour and material parameters that all surfels share. Each has one row and no gradient."""
-    one = _initial(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.ones(1), None, settings.surfels, 0.5)
-    return {name: value.detach() for name, value in one.items() if name not in GEOMETRY}
+    one = FirstPoints(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.ones(1), None, None, "")
+    made = _initial(one, settings.surfels, 0.5)
+    return {name: value.detach() for name, value in made.items() if name not in GEOMETRY}
 
 
-def _initial(positions, normals, spacing, colours, surfels: SurfelSettings, opacity: float) -> Parameters:
+def _initial(points: FirstPoints, surfels: SurfelSettings, opacity: float) -> Parameters:
     return initial_parameters(
-        positions,
-        normals,
-        spacing,
-        colours,
+        points.positions,
+        points.normals,
+        points.spacing,
+        points.colours,
         axes=axes_of(surfels),
         opacity=opacity,
         sh_degree=surfels.sh_degree,
@@ -70,106 +50,3 @@ def _initial(positions, normals, spacing, colours, surfels: SurfelSettings, opac
         metallic=surfels.metallic,
         roughness=surfels.roughness,
     )
-
-
-def _hull_points(capture: Capture, views: list[LoadedView], count: int, settings: Settings, hollows: bool):
-    """Place `count` points: most on the visual hull of the masks, the others inside it.
-
-    Returns positions, normals, the spacing of the points, and how many are on the hull. These come first.
-    """
-    surfels, seed, cameras = settings.surfels, settings.train.seed, [view.camera for view in views]
-    photos = [Photo(view.image, view.alpha, view.camera, view.white) for view in views if view.alpha is not None]
-    alphas = [photo.alpha for photo in photos]  # all views have one
-    carve = partial(carve_hollows, photos=photos) if hollows else None
-
-    def within(radius: float) -> tuple:
-        shown = max(1, count - round(surfels.inside * count))
-        grid = {"resolution": surfels.hull, "seed": seed, "on_hull": shown, "carve": carve}
-        found = visual_hull_points(alphas, cameras, capture.centre, radius, count, **grid)
-        return *found, np.arange(count) < shown
-
-    if capture.box is None:
-        *found, on_it = within(capture.radius)
-        return *found, int(on_it.sum())
-    around = within(capture.reach)
-    try:
-        near = within(capture.radius)
-    except InputError:  # masks show an object, but only outside the box
-        raise InputError("nothing that the masks show lies in the region: move its box, or enlarge it") from None
-    chosen = _in_and_around(capture.box, near[0], around[0], count, seed)
-    positions, normals, _, on_it = (
-        np.concatenate([values[rows] for values, rows in zip(pair, chosen, strict=True)])
-        for pair in zip(near, around, strict=True)
-    )
-    order = np.argsort(~on_it, kind="stable")
-    return positions[order], normals[order], _spacing(positions[order]), int(on_it.sum())
-
-
-def _in_and_around(
-    box: Box, near: np.ndarray, around: np.ndarray, count: int, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Choose at random some points of `near` (N, 3) that lie inside the box, and some of `around` (M, 3) that lie outside.
-
-    Returns their indices in `near` and in `around`, at most `count` together. At most the fraction AROUND of `count` lies outside. Raises
-    InputError if no point of `near` is inside the box.
-    """
-    rng = np.random.default_rng(seed)
-    inner, outer = np.flatnonzero(box.contains(near)), np.flatnonzero(~box.contains(around))
-    if len(inner) == 0:
-        raise InputError("nothing that the photos show lies in the region: move its box, or enlarge it")
-    outer = rng.permutation(outer)[: int(AROUND * count)]
-    return np.sort(rng.permutation(inner)[: count - len(outer)]), np.sort(outer)
-
-
-def _enough(points: np.ndarray, box: Box | None) -> bool:
-    """Tell whether structure from motion found at least 100 points in the region to train, enough for surfels to start at."""
-    return len(points if box is None else points[box.contains(points)]) >= 100
-
-
-def _thinned(points: np.ndarray, capture: Capture, count: int, seed: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Choose at most `count` of the `points` (N, 3). Returns them, and their colours if these are known."""
-    colours, chosen = capture.point_colors, slice(None)
-    if capture.box is not None:
-        chosen = np.concatenate(_in_and_around(capture.box, points, points, count, seed))
-    elif len(points) > count:
-        chosen = np.random.default_rng(seed).choice(len(points), count, replace=False)
-    return points[chosen], None if colours is None else colours[chosen]
-
-
-def _random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
-    """Place `count` points at random, evenly in the ball that the cameras look at, or in the region to train if there is one.
-
-    In a room, or if there is a region to train, up to half of the points are placed farther out, for the surroundings. They are uniform in
-    inverse distance.
-    """
-    rng = np.random.default_rng(seed)
-    direction = rng.normal(size=(count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    distance = np.cbrt(rng.random(count))
-    if capture.box is not None or not capture.bounded:
-        beyond = distance[:: 2 if capture.box is None else 1]
-        beyond[:] = 1 / rng.uniform(0.1, 1, len(beyond))
-    points = capture.centre + capture.radius * distance[:, None] * direction
-    if capture.box is None:
-        return points
-    matrix = capture.box.matrix
-    near = rng.uniform(-1, 1, (count, 3)) @ matrix[:3, :3].T + matrix[:3, 3]
-    inner, outer = _in_and_around(capture.box, near, points, count, seed)
-    return np.concatenate([near[inner], points[outer]])
-
-
-def _towards_cameras(positions: np.ndarray, views: list[LoadedView]) -> np.ndarray:
-    """Compute the unit vectors (N, 3) from each point to the nearest camera.
-
-    They are used as normals, because a surface that a photo shows faces a camera.
-    """
-    cameras = np.stack([view.camera.position for view in views])
-    towards = cameras[cKDTree(cameras).query(positions)[1]] - positions
-    return towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-
-
-def _spacing(positions: np.ndarray) -> np.ndarray:
-    """Compute each point's mean distance (N,) to its three nearest neighbours."""
-    k = min(4, len(positions))
-    distance = cKDTree(positions).query(positions, k=k)[0][:, 1:] if k > 1 else np.ones((len(positions), 1))
-    return np.maximum(distance.mean(axis=1), 1e-7)

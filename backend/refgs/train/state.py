@@ -10,6 +10,7 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.capture import Capture, load_views
 from refgs.clock import Clock
+from refgs.effective import By, Effective
 from refgs.events import Report
 from refgs.formats.needs import Found
 from refgs.geometry.visibility import Occluder
@@ -20,7 +21,6 @@ from refgs.render.baselines import Method, initial_stage, method_of
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.run_folder import PHOTOS
 from refgs.settings import LossSettings, RenderSettings, Settings
-from refgs.train.effective import By, Effective
 from refgs.train.photo import Crop, Photo
 from refgs.train.plan import Plan
 

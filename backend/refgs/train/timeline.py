@@ -8,6 +8,7 @@ A training's progress is the fraction of its iterations that are done, 0..1.
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 from refgs.render.rendering import Rendering
@@ -20,11 +21,8 @@ from refgs.train.state import State, why_not_traced
 RESET = 0.01  # opacity to which a reset lowers all surfels
 # Surfels explain a picture from this opacity on: while they are fainter, nothing is decided, and no mesh is made.
 SEEN = 0.2
-POSES_FROM, POSES_KNOWN, POSES_UNTIL = (
-    0.05,
-    0.3,
-    2 / 3,
-)  # parts of the training: poses start to learn, are judged, and are frozen
+# Parts of the training after which poses start to learn, are judged, and are frozen.
+POSES_FROM, POSES_KNOWN, POSES_UNTIL = 0.05, 0.3, 2 / 3
 WHOLE_EVERY = 8  # one in this many iterations sees its whole photo, so that nothing stays beyond the margin of a crop
 REFLECTING = ("albedo", "metallic", "roughness", "indirect_dc", "indirect_rest", "environment", "exposure")
 PHOTO_STAGES = (0.35, 4), (0.7, 2)  # part of the training until which photos are reduced, and by what factor
@@ -58,9 +56,8 @@ class When(NamedTuple):
     holds: Test
 
     def __and__(self, other: "When") -> "When":
-        return When(
-            f"{self.words}, {other.words}", lambda state, step: self.holds(state, step) and other.holds(state, step)
-        )
+        words = f"{self.words}, {other.words}"
+        return When(words, lambda state, step: self.holds(state, step) and other.holds(state, step))
 
 
 class Every(NamedTuple):
@@ -182,11 +179,9 @@ def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total:
     if not every or last < every:
         return False
     since, decay = last // every * every, rates.decay
-    iterations = (
-        iteration - since
-        if decay == 1
-        else total * (decay ** (since / total) - decay ** (iteration / total)) / -math.log(decay)
-    )
+    iterations = iteration - since
+    if decay != 1:
+        iterations = total * (decay ** (since / total) - decay ** (iteration / total)) / -math.log(decay)
     opacity = max(opacity, RESET)
     return iterations * rates.opacity < 4 * math.log(opacity / (1 - opacity) * (1 - RESET) / RESET)
 
@@ -255,10 +250,16 @@ RESTS = When(
     and since < state.settings.propagation.rest,
 )
 
+LARGER = Every(", ".join(f"after {until:.0%}" for until, _ in PHOTO_STAGES), lambda state: 1)
+DECIDE = partial(Row, every=ONCE, only_if=DECIDABLE, clock="deciding")
+HALFWAY = When("50%", lambda state, step: 2 * step.done >= state.total)
+LATE = When("70% from `residual.start` to the end", lambda state, step: step.progress >= _late(state, 0.7))
+PROPAGATES = When("before `propagation.stop`", lambda state, step: since_propagation(state, step.done) == 0)
+RESETS = When("before `densify.stop`, normals are not propagated", _resets)
+TENFOLD = When("10 times while iterations grow tenfold", lambda state, step: even_by_logarithm(step.done))
+
 BEFORE = (
-    Row(
-        "take larger photos", every=Every(", ".join(f"after {until:.0%}" for until, _ in PHOTO_STAGES), lambda state: 1)
-    ),
+    Row("take larger photos", every=LARGER),
     Row("start the deferred stage", setting("initial.until"), every=ONCE, only_if=INITIAL),
     Row("start the residual", RESIDUAL, every=ONCE),
     Row("set the rates"),
@@ -284,44 +285,17 @@ AFTER = (
     Row("make a mesh", setting("indirect.start"), RESIDUAL, period("indirect.every"), NOT_INITIAL & NOT_ENDED & OPAQUE),
     Row("decide on inter-reflection", only_if=NEW_MESH, clock="deciding"),
     Row("trace what surfels receive", only_if=NEW_MESH, clock="visibility"),
-    Row("time the crops", iteration(100), every=ONCE, only_if=DECIDABLE, clock="deciding"),
-    Row(
-        "look at a matte scene again",
-        When("50%", lambda state, step: 2 * step.done >= state.total),
-        every=ONCE,
-        only_if=DECIDABLE,
-        clock="deciding",
-    ),
-    Row(
-        "decide on specular shading",
-        part_after_initial(0.05) & iteration(100),
-        every=ONCE,
-        only_if=DECIDABLE,
-        clock="deciding",
-    ),
-    Row("decide on the light's texels", part_after_initial(0.19), every=ONCE, only_if=DECIDABLE, clock="deciding"),
-    Row(
-        "decide on degrees of harmonics",
-        When("70% from `residual.start` to the end", lambda state, step: step.progress >= _late(state, 0.7)),
-        every=ONCE,
-        only_if=DECIDABLE,
-        clock="deciding",
-    ),
-    Row("find metals", part_after_initial(0.1) & iteration(100), RESIDUAL, ONCE, only_if=METALS, clock="deciding"),
+    DECIDE("time the crops", iteration(100)),
+    DECIDE("look at a matte scene again", HALFWAY),
+    DECIDE("decide on specular shading", part_after_initial(0.05) & iteration(100)),
+    DECIDE("decide on the light's texels", part_after_initial(0.19)),
+    DECIDE("decide on degrees of harmonics", LATE),
+    DECIDE("find metals", part_after_initial(0.1) & iteration(100), RESIDUAL, only_if=METALS),
     Row("judge metals", until=RESIDUAL, only_if=JUDGED & FROM_HULL & METALS, clock="deciding"),
     Row("even coloured metal out", None, part(0.6), iterations(50)),
     Row("prune and divide surfels", setting("densify.start"), None, period("densify.every"), PRUNABLE),
-    Row(
-        "propagate normals",
-        every=period("propagation.every"),
-        only_if=When("before `propagation.stop`", lambda state, step: since_propagation(state, step.done) == 0),
-        clock="densification",
-    ),
-    Row(
-        "reset opacities",
-        every=period("densify.reset_every"),
-        only_if=When("before `densify.stop`, normals are not propagated", _resets),
-    ),
+    Row("propagate normals", every=period("propagation.every"), only_if=PROPAGATES, clock="densification"),
+    Row("reset opacities", every=period("densify.reset_every"), only_if=RESETS),
     Row("leave out exposures that agree", part(0.3), None, share(1 / 20), NOT_INITIAL & OPAQUE),
     Row("judge the poses", part(POSES_KNOWN), every=ONCE),
 )
@@ -330,9 +304,5 @@ AFTER = (
 DIVIDE = Row("divide surfels, not only prune", until=setting("densify.stop"))
 PLAN = Row("plan the iterations that fit into the time", only_if=When("10 after the start, then every 50", _first_plan))
 REPORT = Row("report the progress, look for broken numbers", every=iterations(10))
-RECORD = Row(
-    "measure errors into the history",
-    only_if=NOT_ENDED
-    & When("10 times while iterations grow tenfold", lambda state, step: even_by_logarithm(step.done)),
-)
+RECORD = Row("measure errors into the history", only_if=NOT_ENDED & TENFOLD)
 CHECKPOINT = Row("write a checkpoint", every=period("train.checkpoint_every"), only_if=NOT_ENDED)

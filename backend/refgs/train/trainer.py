@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from refgs.capture import Capture, release_memory
+from refgs.effective import Effective
 from refgs.events import Report
 from refgs.memory import trim
 from refgs.run_folder import CHECKPOINTS
 from refgs.settings import Settings
 from refgs.train.decide import needs, photos
 from refgs.train.decide.need import Given
-from refgs.train.effective import Effective
 from refgs.train.keep import checkpoint, history, snapshot
 from refgs.train.keep.measures import Measures
 from refgs.train.keep.progress import Means

@@ -6,14 +6,14 @@ import torch
 
 from refgs.formats.needs import Found
 from refgs.model.prefilter import IRRADIANCE_SIDE
+from refgs.render.sums import blended_shares
 from refgs.train import probe
 from refgs.train.decide.materials import INDIRECT
 from refgs.train.decide.need import ASKED, MEGA, NUMBER, Decision, Given, Moment, Need, megabytes
 from refgs.train.learn import light
 from refgs.train.state import RenderInputs, State
 
-# PSNR in dB over a small part of the object (`probe.PART`): in the mean, the rest of the object hides it.
-VISIBLE = 0.1
+VISIBLE = 0.1  # dB over a small part of the object (`probe.PART`): in the mean, the rest of the object hides it
 
 
 class Reflections(Need):
@@ -81,8 +81,7 @@ class Light(Need):
     name, what = "light", "all of the light's texels"
     threshold, reason = 0.01, "dB; a coarser light that costs more is not taken, whatever the roughness"
     moments, follows = ("light",), "specular"
-    # Fraction of the picture that may be glossier than the roughness for which texels are chosen.
-    GLOSSIEST = probe.PART / 2
+    GLOSSIEST = probe.PART / 2  # part of the picture that may be glossier than the roughness that chooses texels
     LOBE = 0.5  # fraction of a lobe's width that a texel may take
 
     def due(self, state: State, moment: Moment) -> bool:
@@ -96,8 +95,8 @@ class Light(Need):
             side, roughness = coarsest, None
             why = f"nothing is mirrored: irradiance has {coarsest} texels along a side"
         else:
-            photos = [state.photo(view) for view in probe.spread_views(state)]
-            weight = probe.blended_shares(inputs.surfels, photos, state.near).sum(dim=0)
+            cameras = [state.photo(view).camera for view in probe.spread_views(state)]
+            weight = blended_shares(inputs.surfels, cameras, state.near).sum(dim=0)
             roughness = probe.quantile(inputs.surfels.roughness, weight, self.GLOSSIEST)
             side = resolvable(roughness, self.LOBE, finest, coarsest)
             rougher = f"{1 - self.GLOSSIEST:.1%} of the pictures are rougher than {roughness:.2f}"
@@ -108,7 +107,7 @@ class Light(Need):
         side = min(side, inputs.light.resolution)
 
         def coarse(inputs: RenderInputs) -> RenderInputs:
-            return inputs._replace(environment=probe.pooled(inputs.light, side))
+            return inputs._replace(environment=inputs.light.reduced(side))
 
         loss = probe.psnr_loss(state, coarse)
         if (loss.whole > self.threshold or loss.part > VISIBLE) and self.asked(state) == "auto":

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from refgs.formats.needs import Found
 from refgs.model.surfels import Surfels
+from refgs.render.sums import blended_shares
 from refgs.train import probe
 from refgs.train.decide.need import ASKED, MEGA, Decision, Given, Moment, Need, megabytes
 from refgs.train.material import metals
@@ -16,8 +17,7 @@ from refgs.train.state import RenderInputs, State, why_not_traced
 # Change of encoded colour with the view, of 1; matte clay has 0.037, an embossed gold cape in flat light 0.056, a mirror 0.2.
 SHINES = 0.042
 SMALL_PART = 1.0  # dB over a small part (`probe.PART`); matte clay has -1.2, a clay pig with a chrome bell 1.7
-# Fraction of the pictures, at either end of the values, whose surfels are ignored in the search for a common value.
-RARE = 1e-3
+RARE = 1e-3  # part of the pictures, at either end of the values, that is ignored in the search for a common value
 INDIRECT = "indirect_dc", "indirect_rest", "received"
 
 
@@ -120,8 +120,8 @@ class Constants(Need):
         """
         if self.asked(state) == "on" or not state.method.lit:
             return {}
-        photos = [state.photo(view) for view in probe.spread_views(state)]
-        weight = probe.blended_shares(surfels, photos, state.near).sum(dim=0) * kept
+        cameras = [state.photo(view).camera for view in probe.spread_views(state)]
+        weight = blended_shares(surfels, cameras, state.near).sum(dim=0) * kept
         found = {}
         for name in ("metallic", "roughness"):
             values = getattr(surfels, name)

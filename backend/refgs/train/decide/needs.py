@@ -21,31 +21,11 @@ from refgs.train.timeline import Step
 
 CONSTANTS, SPECULAR = Constants(), Specular()
 NEEDS: tuple[Need, ...] = (
-    Views(),
-    SPECULAR,
-    Reflections(),
-    Initial(),
-    Iterations(),
-    Outside(),
-    Light(),
-    Degrees(),
-    CONSTANTS,
-)
+    Views(), SPECULAR, Reflections(), Initial(), Iterations(), Outside(), Light(), Degrees(), CONSTANTS,
+)  # fmt: skip
 """Needs that are due at the same moment are decided in this order."""
 
 BY_NAME = {need.name: need for need in NEEDS}
-
-__all__ = [
-    "BY_NAME",
-    "CONSTANTS",
-    "NEEDS",
-    "bring_back_specular",
-    "evaluate",
-    "look_again",
-    "reflections",
-    "restore",
-    "rows",
-]
 
 
 def evaluate(state: State, moment: Moment, given: Given = Given()) -> list[str]:  # noqa: B008  (it is frozen)

@@ -12,8 +12,7 @@ from refgs.train.photo import MARGIN, crop_of
 from refgs.train.state import State
 from refgs.train.timeline import WHOLE_EVERY, Step
 
-# Duplicates move by fewer pixels, and their PSNR is higher: they differ by 8-bit noise alone.
-ALIKE_PIXELS, ALIKE_DECIBELS = 0.5, 40.0
+ALIKE_PIXELS, ALIKE_DECIBELS = 0.5, 40.0  # duplicates move by less, and differ by 8-bit noise alone
 
 
 class Views(Need):

@@ -70,8 +70,6 @@ def _specular(state: State, found: Found, views: list[int]) -> Iterator[tuple[Te
 def _reflections(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
     """Render two guesses at what the object mirrors where it hides the light: its own mean radiance, and the light behind it.
 
-    The object's true reflection of itself is not known before it is traced.
-
     What the object mirrors of itself is not known before it is traced.
     """
     inputs = state.inputs()
@@ -98,7 +96,7 @@ def _light(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tenso
     inputs = state.inputs()
     if found.needed or inputs.settings.reflection == "none":
         return
-    coarse = inputs._replace(environment=probe.pooled(inputs.light, int(found.side or 0)))
+    coarse = inputs._replace(environment=inputs.light.reduced(int(found.side or 0)))
     for view in views:
         yield probe.picture(state, view, inputs).color, probe.picture(state, view, coarse).color
 

@@ -18,6 +18,7 @@ from refgs.model.surfels import Surfels, to_splats
 from refgs.paths import write_text
 from refgs.render.composite import blended_normals
 from refgs.render.facing import facing_cosine
+from refgs.render.sums import blended_shares
 from refgs.render.volume import with_normals_last
 from refgs.run import OCCLUDER
 from refgs.run_folder import SPLATS, update_metrics
@@ -27,7 +28,6 @@ from refgs.train.learn import poses
 from refgs.train.learn.exposures import exposure
 from refgs.train.learn.poses import Poses
 from refgs.train.material import metals
-from refgs.train.probe import blended_shares
 from refgs.train.state import State, why_not_traced
 
 
@@ -47,9 +47,8 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
     side, wanted = _seen_side(surfels, state), state.wanted()
     kept = wanted & (side != 0)
     if not kept.any():
-        raise InputError(
-            "the photos show nothing in the region: move its box, or enlarge it, and train into a new folder"
-        )
+        advice = "move its box, or enlarge it, and train into a new folder"
+        raise InputError(f"the photos show nothing in the region: {advice}")
     surfels, constants = _with_constants(surfels, state, kept)
     splats = to_splats(surfels.chosen(kept))
     splats.constants = constants
@@ -170,7 +169,7 @@ def _seen_side(surfels: Surfels, state: State) -> Tensor:
     normals = surfels.normals()
     side = seen = torch.zeros(len(normals), device=state.device)
     for photo in state.photos:
-        weight = blended_shares(surfels, [photo], state.near)[0]
+        weight = blended_shares(surfels, [photo.camera], state.near)[0]
         side = side + weight * facing_cosine(surfels.positions, normals, photo.camera).sign()
         seen = seen + weight
     known = seen > 0 if (seen > 0).any() else torch.ones_like(seen, dtype=torch.bool)

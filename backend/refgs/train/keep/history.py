@@ -14,8 +14,7 @@ from refgs.train.keep.progress import Means
 from refgs.train.state import State
 from refgs.train.timeline import FIRST_LINE
 
-# Fraction of the training's time that measuring may take; FLIP, as slow as the rest, may take as much again.
-SHARE = 0.025
+SHARE = 0.025  # part of the training's time that measuring may take; FLIP may take as much again
 BESIDE = ("reading", "start", "writing", "measuring", "FLIP")  # parts of the clock that do not count as training time
 
 
@@ -43,13 +42,8 @@ def record(state: State, measures: Measures) -> None:
     limit = math.inf if state.ended else allowed(state.iteration, state.total, state.seconds)
     parts = dict(state.clock.seconds)
     parts["other"] = state.seconds - sum(value for name, value in parts.items() if name not in BESIDE)
-    facts = {
-        "iteration": state.iteration,
-        "seconds": round(state.seconds, 3),
-        "loss": means.loss,
-        "psnr_train": means.psnr,
-        "splats": state.learned.count,
-    }
+    facts = {"iteration": state.iteration, "seconds": round(state.seconds, 3), "loss": means.loss}
+    facts |= {"psnr_train": means.psnr, "splats": state.learned.count}
     for part, measure in (("measuring", measures.errors), ("FLIP", measures.flip)):
         if parts.get(part, 0.0) <= limit:
             with state.clock.part(part):

@@ -26,8 +26,5 @@ def write_preview(state: State) -> dict[str, str | int]:
         rendering = state.render(view.camera, surfels)
         write_png(folder / "view.png", color_picture(rendering, np.array(state.settings.image.background)))
         write_splats(folder / "splats.ply", to_splats(with_normals_last(surfels)))
-    return {
-        "iteration": state.iteration,
-        "view": str((folder / "view.png").resolve()),
-        "splats": str((folder / "splats.ply").resolve()),
-    }
+    files = {name: str((folder / file).resolve()) for name, file in (("view", "view.png"), ("splats", "splats.ply"))}
+    return {"iteration": state.iteration, **files}

@@ -26,11 +26,8 @@ def save(state: State) -> None:
         parts[part.name] = {name: value for name, value in found.items() if f"{part.name}.{name}" not in own}
     facts = {"seconds": state.seconds, "total": state.total, "initial": state.initial, "residual": state.residual}
     facts |= {"clock": state.clock.seconds, "spent": state.plan.spent, "processor_seconds": state.clock.processor}
-    facts |= {
-        "decided": state.decided,
-        "needs": {name: found.model_dump(exclude_none=True) for name, found in state.needs.items()},
-    }
-    facts["parts"] = parts
+    found = {name: found.model_dump(exclude_none=True) for name, found in state.needs.items()}
+    facts |= {"decided": state.decided, "needs": found, "parts": parts}
     checkpoint.save(state.folder / "checkpoints", state.iteration, tensors, facts)
 
 

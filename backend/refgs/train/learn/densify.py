@@ -7,13 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from refgs.capture.first_points import AROUND
 from refgs.errors import TryAgain
 from refgs.model.learned import Learned
 from refgs.model.surfels import activate, axes
+from refgs.render.screen_gradient import ScreenGradient
 from refgs.settings import DensifySettings
 from refgs.train.part import Fact, Part
-from refgs.train.screen_gradient import ScreenGradient
-from refgs.train.start import AROUND
 from refgs.train.state import State
 from refgs.train.timeline import DIVIDE, RESET, Step
 

@@ -12,8 +12,7 @@ from refgs.train.timeline import Step
 # Ways in which a photo's response may change, as logarithms of factors of red, green and blue: brightness, temperature and tint. The last
 # two are the white balance. They are scaled down so that they learn more slowly, because photos differ less in them.
 EXPOSURE = (1.0, 1.0, 1.0), (0.5, 0.0, -0.5), (-0.25, 0.5, -0.25)
-# A third of a stop, the step of a camera's dial: smaller differences may be errors of the shading.
-ALIKE = math.log(2) / 3
+ALIKE = math.log(2) / 3  # a third of a stop, as on a camera's dial; less may be an error of the shading
 BALANCED = 0.1  # largest difference of a channel's logarithm that may still be an error of the shading
 
 

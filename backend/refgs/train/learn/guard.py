@@ -85,9 +85,8 @@ def warn(state: State, what: str) -> None:
 @torch.no_grad()
 def remove_broken(learned: Learned) -> int:
     """Remove surfels that have a number that is not finite. Returns how many. Raises InputError if none would be left."""
-    whole = torch.stack([value[:, None].flatten(1).isfinite().all(dim=1) for value in learned.by_row.values()]).all(
-        dim=0
-    )
+    finite = [value[:, None].flatten(1).isfinite().all(dim=1) for value in learned.by_row.values()]
+    whole = torch.stack(finite).all(dim=0)
     count = int((~whole).sum())
     if count == len(whole):
         raise InputError("no surfel is finite any more: train anew with lower rates (--set rates.…)")

@@ -8,29 +8,18 @@ import math
 import torch
 from torch import Tensor
 
-from refgs.camera import Camera
 from refgs.clock import timed
 from refgs.model import cubemap
 from refgs.model.environment import Environment
-from refgs.model.surfels import Surfels
-from refgs.render.channels import channels
-from refgs.render.rasterize import rasterize
-from refgs.render.rendering import SOLID
-from refgs.render.shade import mirror_directions
-from refgs.render.stack import stack
-from refgs.render.volume import discs
-from refgs.settings import RenderSettings, Settings
+from refgs.render.mirrored_light import mirrored_light
+from refgs.settings import Settings
 from refgs.train.part import Part
 from refgs.train.state import State
 from refgs.train.timeline import Step
 
 LEAST_SIDE = 16  # texels along a side
-DIFFUSED = (
-    # Texels along a side for which `environment.diffusion` is given; at other sides, it reaches as far on the sphere.
-    64
-)
+DIFFUSED = 64  # texels along a side for which `environment.diffusion` is given; with others, it reaches as far
 MIRROR_VIEWS = 24  # views that tell which part of the light the object mirrors
-MIRROR_SIDE = 16  # texels along a side of the coarse cubemap in which mirrored directions are counted
 
 
 class MirroredLight(Part):
@@ -67,9 +56,7 @@ def refine(state: State, step: Step) -> None:
 @torch.no_grad()
 def coarsen(state: State, side: int) -> None:
     """Reduce the cubemap to `side` texels along a side by averaging texels."""
-    fine = math.isqrt(len(state.learned["environment"]) // 6) // side
-    texels = state.learned["environment"].view(6, side, fine, side, fine, 3).mean(dim=(2, 4)).reshape(-1, 3)
-    state.learned.learn("environment", texels, by_row=False)
+    state.learned.learn("environment", cubemap.reduced(state.learned["environment"], side), by_row=False)
 
 
 @timed("optimiser")
@@ -106,36 +93,5 @@ def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
     if mirrors.weight is None or len(mirrors.weight) != len(light.radiance):
         cameras = state.spread_cameras(MIRROR_VIEWS)
         with torch.no_grad():
-            mirrors.weight = mirrored(state.surfels(), cameras, light, state.settings.render, state.near)
+            mirrors.weight = mirrored_light(state.surfels(), cameras, light, state.settings.render, state.near)
     return mirrors.weight @ light.radiance
-
-
-def mirrored(
-    surfels: Surfels, cameras: list[Camera], light: Environment, settings: RenderSettings, near: float
-) -> Tensor:
-    """Return a weight for each texel of the light (6·R²,), where R is the cubemap's side. The weights sum to one.
-
-    The weight is proportional to the number of pixels in which the cameras see the texel's surroundings mirrored in the object. Without it,
-    directions that only a few pixels mirror could take any colour to make the mean grey. If no texel is mirrored, all texels are weighted
-    by their solid angles. Surfels nearer to a camera than `near` are not drawn.
-    """
-    pixels = torch.zeros(6 * MIRROR_SIDE * MIRROR_SIDE)
-    settings = settings.model_copy(update={"reflection": "microfacet"})  # treat matte surfaces as reflective here
-    for camera in cameras:
-        lit = stack(channels(surfels, camera, settings, indirect=True))
-        features, _, alpha = rasterize(*discs(surfels, camera), lit, camera, near=near)
-        turn = torch.from_numpy(light.turn(camera)).float().T
-        mirrored = _texels_at(mirror_directions(features, alpha, camera)[alpha > SOLID].cpu() @ turn)
-        pixels += torch.bincount(mirrored, minlength=len(pixels))
-    part = _texels_at(cubemap.texel_directions(light.resolution).float())
-    weights = (pixels / torch.bincount(part, minlength=len(pixels)).clamp_min(1))[part]
-    if not pixels.any():
-        weights = cubemap.texel_solid_angles(light.resolution).float()
-    return (weights / weights.sum()).to(light.radiance.device)
-
-
-def _texels_at(directions: Tensor) -> Tensor:
-    """Return the indices of the texels that lie in the directions (P, 3), on a coarse cubemap with MIRROR_SIDE texels along a side."""
-    face, s, t = cubemap.face_coordinates(directions)
-    column, row = (((x + 1) / 2 * MIRROR_SIDE).long().clamp(0, MIRROR_SIDE - 1) for x in (s, t))
-    return (face * MIRROR_SIDE + row) * MIRROR_SIDE + column

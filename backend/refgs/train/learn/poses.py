@@ -25,8 +25,7 @@ from refgs.train.timeline import POSES_FROM, POSES_KNOWN, Step
 
 LONGEST_STEP = 0.02  # largest step, in radians and in scene radii
 SAMPLE = 1000  # surfels whose shift in the photos is measured
-# Pixels between features and their epipolar lines; poses with less count as exact; four real captures have 0.1.
-EXACT = 0.3
+EXACT = 0.3  # pixels between features and epipolar lines; poses with less are exact; real captures have 0.1
 BETTER = 0.5  # refined poses must come below this fraction of the given poses' distance
 
 
@@ -110,9 +109,8 @@ def judge(state: State, step: Step) -> None:
         return
     poses.judged = True
     # Match the pairs that `start` matched. Refined cameras may have other neighbours, with too few matches to tell.
-    matches = match_neighbours(
-        [replace(view, camera=camera) for view, camera in zip(state.views, poses.given, strict=True)]
-    )
+    given = [replace(view, camera=camera) for view, camera in zip(state.views, poses.given, strict=True)]
+    matches = match_neighbours(given)
     given, found = (pixels_apart(matches, cameras) for cameras in (poses.given, [view.camera for view in state.views]))
     if found is not None and given is not None and found < BETTER * given:
         what = f"the cameras' poses are refined: features are {found:.1f} pixels off, and were {given:.1f}"

@@ -212,10 +212,8 @@ def _with_axes(state: State, normals: Maps) -> Maps:
         return {}
     if signs is None:
         axes = "in world space"
-        normals = {
-            view: ((codes.float() @ to_camera(view).T).round().to(torch.int8), camera)
-            for view, (codes, camera) in normals.items()
-        }
+        for view, (codes, camera) in normals.items():
+            normals[view] = (codes.float() @ to_camera(view).T).round().to(torch.int8), camera
     else:
         words = ("left", "right"), ("up", "down"), ("to the camera", "away")
         named = (pair[int(sign > 0)] for pair, sign in zip(words, signs, strict=True))

@@ -22,18 +22,15 @@ from refgs.train.material.observe import (
 )
 
 FEW = 32  # neighbours, where the size of a change is asked and not its colour: averaging over more would even it out
-# Distance of a chromaticity from grey; below it, metals and dielectrics change alike; silver has 0.03, copper 0.14.
-SATURATED = 0.08
+SATURATED = 0.08  # distance from grey; below it, metals and dielectrics change alike; silver has 0.03, copper 0.14
 CHANGES = 0.15  # relative to the mean radiance; smaller changes may be texture that is slightly misaligned
 FAINT_CHANGES = 0.08  # enough for surfels whose neighbours change clearly, in their own colour as well
-# May be noise, unless nearly the whole surface changes so much; embossed gold has 0.07 to 0.2.
-FAINTEST_CHANGES = 0.05
+FAINTEST_CHANGES = 0.05  # may be noise, unless nearly the whole surface has it; embossed gold has 0.07 to 0.2
 GROWTH = 8  # times that metals spread to their neighbours
 LOW = 0.15  # quantile of a surfel's radiance at which its drop is measured; darker photos may be shadows or outlines
 # Least drop, relative to the light's mean radiance; a dielectric mirrors 0.04 of the light, and cannot fall much farther below its median.
 DROP = 0.08
-# A metal falls below this fraction of its median, because it has no diffuse light; paint does not fall below 0.94.
-FALLS = 0.88
+FALLS = 0.88  # a metal, without diffuse light, falls below this fraction of its median; paint not below 0.94
 METAL_TINT = 0.6  # tint of the change (0: grey as a dielectric's reflection; 1: of the surface's own colour)
 
 

@@ -19,8 +19,7 @@ from refgs.train.material.observe import LEAST_PIXELS, LEAST_VIEWS, Observations
 SURFELS = 3000  # surfels that are looked at, at most
 LEAST_SURFELS = 400  # fewer surfels tell nothing
 SMOOTHED = 32  # neighbours whose normals are averaged: those of single surfels are rough early in the training
-# Number and sharpness of the lobes that sum to the function of the mirrored direction; 0.3 radians wide, they cover the sphere.
-LOBES, SHARPNESS = 50, 10.0
+LOBES, SHARPNESS = 50, 10.0  # lobes of the mirrored direction, 0.3 radians wide: they cover the sphere
 RIDGE = 1e-3  # ridge, as a fraction of the columns' mean square
 # A light changed only if it explains this much more than mirroring; matte clay has 0.19, seven metals up to 0.08, a sharp mirror 0.17.
 CHANGED = 0.13
@@ -28,8 +27,7 @@ CHANGED = 0.13
 LEFT = 0.05
 # Changes are noise if both models together explain less than this; a fox's fur has up to 0.19, six coloured metals from 0.42.
 NOISE = 0.3
-# Side of a grid's cells, in scene radii: models are fitted to one half of the cells and tested on the other.
-CELL = 0.15
+CELL = 0.15  # side of a grid's cells, in scene radii: models are fitted to half of the cells, tested on the others
 
 
 class Explained(NamedTuple):
@@ -76,9 +74,8 @@ def explained(observations: Observations, positions: Tensor, radius: float, *par
     mean, change, known = averaged(observations, near)
     known &= known.sum(dim=1, keepdim=True) >= LEAST_VIEWS
     relative = (change.mean(dim=2) / mean.mean(dim=1, keepdim=True).clamp_min(1e-2)).clamp(-1, 2)
-    smooth = torch.nn.functional.normalize(
-        pooled(observations.normal.flatten(1), near).view_as(observations.normal), dim=2
-    )
+    normal = observations.normal
+    smooth = torch.nn.functional.normalize(pooled(normal.flatten(1), near).view_as(normal), dim=2)
     smoothed = observations._replace(normal=smooth)
     return [_explained(smoothed, relative, known & part[:, None], positions / (CELL * radius)) for part in parts]
 

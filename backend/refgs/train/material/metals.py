@@ -19,8 +19,7 @@ from refgs.train.state import State
 from refgs.train.timeline import Step, metals_decidable
 
 GIVEN = Kinds(metal=0.9, paint=0.02)  # metallic that is set first; training can still change it
-# All is metal if a larger fraction of the surface shines as coloured metals do; a gold cape has 0.95, matte clay 0.71.
-CERTAIN = 0.85
+CERTAIN = 0.85  # part of the surface that shines as coloured metals do: all is metal; gold 0.95, matte clay 0.71
 # Dark parts may be metal if a larger fraction of the coloured surface shines; a bronze head has 0.69, a car 0.14.
 MOSTLY = 0.6
 TELLING = 0.3  # fraction of the surface that must be coloured to tell about the rest; a bronze head has 0.48

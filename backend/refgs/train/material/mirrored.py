@@ -95,10 +95,8 @@ def _fit(seen: Seen, mirrored: Iterable[list[Tensor]], positions: Tensor) -> Fit
     F are the entries 0, 1 and 3 of `brdf.reflectance_table`. Sums over photos suffice to fit both.
     """
     near, count = neighbours(positions, NEIGHBOURS), len(positions)
-    sums = {
-        name: torch.zeros(len(ROUGHNESSES), count, 3, dtype=torch.double)
-        for name in ("rest", "both", "power", "paint", "first")
-    }
+    names, shape = ("rest", "both", "power", "paint", "first"), (len(ROUGHNESSES), count, 3)
+    sums = {name: torch.zeros(shape, dtype=torch.double) for name in names}
     changes = torch.zeros(
         count, 4, dtype=torch.double
     )  # weighted sums: mirrored, shown, their product, the square of the mirrored

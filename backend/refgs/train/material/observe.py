@@ -10,6 +10,7 @@ from refgs.color import srgb_decode
 from refgs.model import harmonics
 from refgs.model.environment import turn_between
 from refgs.model.surfels import Surfels
+from refgs.render.sums import pixel_sums
 from refgs.train import probe
 from refgs.train.learn.exposures import exposure
 from refgs.train.photo import Photo
@@ -18,12 +19,10 @@ from refgs.train.state import RenderInputs, State
 OBSERVED_VIEWS = 24  # photos that are looked at, at the most
 SWEEPS = 2  # steps in which surfels' radiance is fitted to the photos
 OVERSHOOT = 1.5  # factor on the later steps: surfels share pixels, so that plain steps are too short
-# Least cosine between a surfel's normal and the camera; at more grazing angles, even matte surfaces change, by Fresnel.
-FACING = 0.4
+FACING = 0.4  # least cosine between normal and camera; at grazing angles, Fresnel changes even matte surfaces
 LEAST_PIXELS = 0.5  # pixels that a surfel must have in a photo; fewer tell more about its neighbours
 LEAST_VIEWS = 6  # photos that must show a surfel
-# Fraction of a surfel's pixels; if more are clipped in a photo, highlights look whiter there than they are.
-LEAST_CLIPPED = 0.05
+LEAST_CLIPPED = 0.05  # part of a surfel's pixels; where more are clipped, highlights look too white
 DARK = 0.03  # linear radiance; darker surfels do not count for a photo's exposure
 NEIGHBOURS = 64  # surfels whose changes are averaged, because too few photos show a single one
 GRAZING = 0.15  # least cosine between normal and camera; at more grazing angles, normals are not good enough
@@ -140,7 +139,7 @@ def _sums(state: State, inputs: RenderInputs, view: int) -> Tensor:
     one = torch.ones_like(radiance[..., :1])
     shown = torch.cat([radiance, one, _clipped(photo), probe.picture(state, view, inputs).normal], dim=-1)
     features = torch.ones_like(inputs.surfels.positions[:, :1]).expand(-1, 8)
-    return probe.pixel_sums(inputs.surfels, photo, state.near, features, lambda _: shown)
+    return pixel_sums(inputs.surfels, photo.camera, state.near, features, lambda _: shown)
 
 
 def _towards(surfels: Surfels, photos: list[Photo]) -> Tensor:
@@ -176,7 +175,7 @@ def _residuals(
         def residual(shown: Tensor, target: Tensor = target, lost: Tensor = lost) -> Tensor:
             return torch.cat([target - shown[..., :3], torch.ones_like(lost), lost], dim=-1)
 
-        sums.append(probe.pixel_sums(surfels, photo, near, features, residual))
+        sums.append(pixel_sums(surfels, photo.camera, near, features, residual))
     totals, pixels, burnt = torch.stack(sums, dim=1).split([3, 1, 1], dim=2)
     return totals, pixels[..., 0], burnt[..., 0]
 

@@ -22,19 +22,16 @@ from refgs.train.material.observe import Kinds, Seen, neighbours
 RATIO = Kinds(metal=0.6, paint=2.5)
 SLOPE, REFLECTANCE = 0.12, 0.35
 SURE = 1.5  # evidence does not count more beyond this logarithm of that ratio
-# Weight of evidence for paint when paint may become metal: a metal whose shape is wrong looks like paint.
-AGAINST_METAL = 0.5
+AGAINST_METAL = 0.5  # weight of evidence for paint: a metal whose shape is wrong looks like paint
 SO_FAR = Kinds(metal=0.15, paint=0.045)  # weight of the kind that training has found so far
-# Probabilities of metal: above the first, paint becomes metal, and below the second, metal becomes paint.
-LIKELY, UNLIKELY = 0.5, 0.2
+LIKELY, UNLIKELY = 0.5, 0.2  # probabilities of metal above which paint becomes metal, and below which metal, paint
 OPEN = 0.02 * SURE  # weight with which `doubt` draws a surfel towards neither kind
 FITTED = 0.01  # weight of a metal's material if it is only fitted, relative to a learned one
 # Weight of differences between neighbours: it decides how far evidence spreads. It grows with the number of surfels, so that evidence
 # spreads as far over a surface however densely surfels cover it. Few surfels need LEAST_REACH.
 REACH, LEAST_REACH = 3.75e-4, 3.0
 LINKED = 16
-# Largest angles, in radians, between neighbours' normals on convex and on concave surfaces.
-BENT, CREASED = 0.35, 0.12
+BENT, CREASED = 0.35, 0.12  # largest angles between neighbours' normals, in radians: convex and concave
 STEP = 0.5  # largest sine of the angle at which a neighbour lies off the surfel's plane
 SHADE = 1.0  # largest difference of the logarithms of the neighbours' mean radiances
 FRINGE = 1.0  # surfels with fewer pixels in all photos take no part

@@ -9,11 +9,11 @@ import tomllib
 from refgs import train_job
 from refgs.asked import Asked
 from refgs.capture import read_capture
+from refgs.effective import Change, Effective
 from refgs.run import create_run, open_run, record_changes
 from refgs.run_folder import read_run_facts
 from refgs.settings import NeedsSettings, load_settings
 from refgs.train.decide.needs import NEEDS
-from refgs.train.effective import Change, Effective
 from refgs.train.fit import between
 from tests.makers.training import SMALL
 

@@ -5,7 +5,7 @@ import numpy as np
 import torch
 
 from refgs.camera import Camera
-from refgs.capture import LoadedView
+from refgs.capture.images import LoadedView
 from refgs.color import srgb_decode
 from refgs.geometry.project import inside, project, sample
 from refgs.model import harmonics

@@ -1,0 +1,49 @@
+"""Find out which part of the light the cameras see mirrored in the object."""
+
+import torch
+from torch import Tensor
+
+from refgs.camera import Camera
+from refgs.model import cubemap
+from refgs.model.environment import Environment
+from refgs.model.surfels import Surfels
+from refgs.render.channels import channels
+from refgs.render.rasterize import rasterize
+from refgs.render.rendering import SOLID
+from refgs.render.shade import mirror_directions
+from refgs.render.stack import stack
+from refgs.render.volume import discs
+from refgs.settings import RenderSettings
+
+SIDE = 16  # texels along a side of the coarse cubemap in which mirrored directions are counted
+
+
+def mirrored_light(
+    surfels: Surfels, cameras: list[Camera], light: Environment, settings: RenderSettings, near: float
+) -> Tensor:
+    """Return a weight for each texel of the light (6·R²,), where R is the cubemap's side. The weights sum to one.
+
+    The weight is proportional to the number of pixels in which the cameras see the texel's surroundings mirrored in the object. Without it,
+    directions that only a few pixels mirror could take any colour to make the mean grey. If no texel is mirrored, all texels are weighted
+    by their solid angles. Surfels nearer to a camera than `near` are not drawn.
+    """
+    pixels = torch.zeros(6 * SIDE * SIDE)
+    settings = settings.model_copy(update={"reflection": "microfacet"})  # treat matte surfaces as reflective here
+    for camera in cameras:
+        lit = stack(channels(surfels, camera, settings, indirect=True))
+        features, _, alpha = rasterize(*discs(surfels, camera), lit, camera, near=near)
+        turn = torch.from_numpy(light.turn(camera)).float().T
+        seen = _texels_at(mirror_directions(features, alpha, camera)[alpha > SOLID].cpu() @ turn)
+        pixels += torch.bincount(seen, minlength=len(pixels))
+    part = _texels_at(cubemap.texel_directions(light.resolution).float())
+    weights = (pixels / torch.bincount(part, minlength=len(pixels)).clamp_min(1))[part]
+    if not pixels.any():
+        weights = cubemap.texel_solid_angles(light.resolution).float()
+    return (weights / weights.sum()).to(light.radiance.device)
+
+
+def _texels_at(directions: Tensor) -> Tensor:
+    """Return the indices of the texels that lie in the directions (P, 3), on a coarse cubemap with SIDE texels along a side."""
+    face, s, t = cubemap.face_coordinates(directions)
+    column, row = (((x + 1) / 2 * SIDE).long().clamp(0, SIDE - 1) for x in (s, t))
+    return (face * SIDE + row) * SIDE + column
