@@ -116,9 +116,9 @@ class Job:
             self._close()
 
     def tell(self, command: str, **facts) -> None:
-        """Send a command with its arguments (`facts`) to the process, as one line of JSON. Write errors are ignored.
+        """Send a command with its arguments (`facts`) to the process, as one line of JSON.
 
-        A write fails if the process has ended, and `poll` reports that.
+        Write errors are ignored: they mean that the process has ended, and `poll` reports its end.
         """
         with contextlib.suppress(OSError, ValueError):
             self._process.stdin.write(json.dumps({"command": command} | facts).encode() + b"\n")
@@ -204,7 +204,7 @@ class Job:
         self._close()
 
     def _close(self) -> None:
-        """Make the process exit, even if it should continue after Blender closes."""
+        """Make the process exit, even if the artist chose that it continues after Blender closes."""
         if self._process is not None:
             if self.kept:
                 self.tell("keep", on=False)
@@ -282,7 +282,7 @@ def make_masks(
     """Start a job that makes masks for a capture's photos, then does the same as `check`. It does not wait for other jobs.
 
     `settings` may have a box about the object, as for `train`. `model` is an ONNX file that finds the object in a photo. Raises InputError
-    if such a job is running already.
+    if another job already makes the masks of this capture.
     """
     kind = {"command": "masks", "capture": str(capture)}
     if any(not job.ended and job.commands and kind.items() <= job.commands[0].items() for job in JOBS):
@@ -342,7 +342,7 @@ class Asked:
       None, the preset is "standard".
     - `settings` overrides single settings: `{"train.iterations": 2000}`.
     - `resume` continues a stopped training.
-    - `hinted` names a finished run and a file of hints: its training is continued in `out`, with its own preset and settings.
+    - `hinted` names a finished run and a file of hints. The training of that run is continued in `out`, with the run's preset and settings.
     """
 
     capture: Path
@@ -354,7 +354,7 @@ class Asked:
     hinted: tuple[Path, Path] | None = None
 
     def command(self) -> dict:
-        """Return the command `train` of the job protocol that asks for it."""
+        """Return the command `train` of the job protocol with these options."""
         command = {"command": "train", "capture": str(self.capture), "out": str(self.out)}
         if self.resume:
             return command | {"minutes": self.minutes, "resume": True}
@@ -368,7 +368,7 @@ def train(python: Path, asked: Asked, log: Path, mesh: bool = True) -> Job:
     """Start a job that trains on a capture and writes the result into a run folder.
 
     The job first waits until earlier trainings have ended. With `mesh`, it also makes a mesh after the training. Raises InputError if the
-    capture is not a folder, if the run folder is being trained already, or if that of a new run is not empty.
+    capture is not a folder, if the run folder is being trained already, or if the folder of a new run is not empty.
     """
     out = asked.out
     if not asked.capture.is_dir():
@@ -386,8 +386,8 @@ def train(python: Path, asked: Asked, log: Path, mesh: bool = True) -> Job:
 def train_many(python: Path, captures: Path, out: Path, log: Path, preset: str) -> Job:
     """Start a job that trains on all captures in the folder `captures`, by `refgs batch`. The runs are made in the folder `out`.
 
-    The job first waits until earlier trainings have ended. Steps that an earlier batch did there are not done again. Raises InputError if
-    `captures` is missing, or a batch works in `out` already.
+    The job first waits until earlier trainings have ended. Steps that an earlier batch completed in `out` are not repeated. Raises
+    InputError if `captures` is missing, or if a batch is already running in `out`.
     """
     if not captures.exists():
         raise InputError(f"{captures} does not exist: choose the folder that the captures are in")

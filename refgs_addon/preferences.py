@@ -109,7 +109,7 @@ def capture_folder(capture: Path) -> Path:
 
 
 def hints_file(run: Path) -> Path:
-    """Return the path of the file with the hints that a run is trained with. It stays when Blender closes, as the training may wait."""
+    """Return the path of the file with a run's hints. The file stays when Blender closes, because the training may read it later."""
     return _folder("hints") / f"{run.name} {crc32(str(run).encode()):08x}.json"
 
 

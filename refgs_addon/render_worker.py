@@ -5,7 +5,8 @@ the first Blender. The commands:
 
 - {"command": "render", "png": …, "hdris": […], "size": …, "samples": …} renders the .blend that is open. With HDRIs it renders a contact
   sheet: the view under each light. Without HDRIs it renders the scene camera's view.
-- {"command": "library", "folder": …, "runs": [{"name": …, "picture": …}]} makes runs of the batch in the folder assets.
+- {"command": "library", "folder": …, "runs": [{"name": …, "picture": …}]} saves runs of the batch in `folder` as
+  Blender assets.
 """
 
 import json

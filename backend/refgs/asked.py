@@ -14,11 +14,12 @@ class Asked:
     """Hold what `refgs train` was asked for. Raises InputError if the arguments are wrong, or do not go together.
 
     - `capture` is the folder of photos and cameras, `out` the run folder.
-    - `minutes` limits the whole job; pauses do not count. Without a `preset`, all settings are chosen to fit into that time. Without both,
-      the preset is `standard`.
-    - `changes` are settings to change, `section.key=value`.
-    - `resume` continues the stopped training in `out`, with its settings.
-    - `run` is a finished run whose training is continued in `out`, with its settings, and `hints` the file that says what its parts are.
+    - `minutes` limits the whole job; pauses do not count. Without a `preset`, all settings are chosen to fit into that time. If neither
+      `preset` nor `minutes` is given, the preset is `standard`.
+    - `changes` are settings that differ from the preset's, each written `section.key=value`.
+    - `resume` continues the stopped training in `out`, with that training's settings.
+    - `run` is a finished run. Its training is continued in `out`, with its settings. `hints` is the file that says which parts of the run's
+      surface are metal or paint.
     """
 
     capture: Path
@@ -48,7 +49,7 @@ class Asked:
 
     @property
     def planned(self) -> bool:
-        """Tell whether all settings are chosen to fit into a time. A run that is continued with hints keeps its own."""
+        """Tell whether all settings are chosen to fit into a time. Not so if a run is continued with hints: the run keeps its settings."""
         return self.preset is None and self.minutes is not None and self.hints is None
 
     @property
@@ -61,14 +62,14 @@ class Asked:
         return [parse_change(change) for change in self.changes]
 
     def settings(self, preset: str | None = None) -> Settings:
-        """Load the preset with the changes. `preset` takes the place of the one asked for. Raises InputError if a setting is wrong.
+        """Load the preset with the changes. `preset` replaces the preset asked for. Raises InputError if a setting is wrong.
 
         If the settings are chosen for a time, they are not known yet: the preset `standard` stands for them.
         """
         return preset_settings(preset or self.preset or "standard", self._assignments)
 
     def resumed(self) -> "Asked":
-        """Return the record that resumes this training. Its run folder holds its settings and its hints."""
+        """Return a copy that asks to resume this training. Its settings and hints are left out: the run folder has them."""
         return replace(self, changes=(), resume=True, run=None, hints=None)
 
     def words(self) -> list[str]:

@@ -21,7 +21,7 @@ EVERY = 1.0  # seconds between looks
 class RunLock:
     """Lock a run folder for this process during a `with` block. Raises TryAgain if another process has locked it.
 
-    What killed processes left half-written in the folder is removed. A folder that does not exist is made.
+    Half-written files that killed processes left in the folder are removed. A folder that does not exist is made.
     """
 
     def __init__(self, folder: Path):
@@ -78,7 +78,7 @@ class RunLock:
 
 
 def remove_stale_lock(folder: Path) -> None:
-    """Remove what a process that was killed at the very end of its work has left: its lock, and what it had half-written."""
+    """Remove the lock and the half-written files of a process that was killed at the very end of its work."""
     if (folder / LOCK).exists():
         with suppress(TryAgain), RunLock(folder):
             pass

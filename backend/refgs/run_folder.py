@@ -28,7 +28,7 @@ _KEPT = (PHOTOS, "log.txt", LOCK, PROGRESS, STOP)  # does no harm to a new run
 def check_free(folder: Path) -> None:
     """Raise InputError if a new run cannot be created in a folder: it holds a run or other files, is a file, or its name is not Unicode.
 
-    A run that has not learned anything, for its training was killed before its first checkpoint, does not count.
+    A run is overlooked if its training was killed before its first checkpoint, because it has learned nothing.
     """
     check_unicode(folder)
     if folder.exists() and not (folder.is_dir() and _nothing_learned(folder)):
@@ -37,7 +37,7 @@ def check_free(folder: Path) -> None:
 
 
 def clear(folder: Path) -> None:
-    """Remove from a folder what a training left that was killed before its first checkpoint. Reduced photos stay: the next one uses them.
+    """Remove the files of a training that was killed before its first checkpoint. Reduced photos stay: the next training uses them.
 
     Raises InputError if the folder holds anything else.
     """
@@ -94,7 +94,11 @@ def _read_run(folder: Path) -> RunFile:
 
 
 def check_asked(asked: Asked) -> None:
-    """Raise InputError if the run in the folder `asked.out` was asked for with other settings, or planned for another time."""
+    """Raise InputError if the run in the folder `asked.out` was trained with other settings than `asked` has.
+
+    If the settings of `asked` are chosen to fit into a time, only the time is compared. A run with hints is not checked: it has
+    the settings of the run that it continues.
+    """
     known = _read_run(asked.out)
     if asked.hints is not None:
         return  # it has the settings of the run that it continues

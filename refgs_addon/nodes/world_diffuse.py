@@ -1,7 +1,7 @@
 """Correct the diffuse light of the world in Eevee, by a node group that the materials of runs share.
 
-For diffuse surfaces, Eevee keeps only the first two bands of spherical harmonics of the world's light. It weakens the second band where
-their sum could be negative. So the bright side of an object is up to a third too dark, and its dark side is too bright. The group
+For diffuse surfaces, Eevee keeps only the first two bands of spherical harmonics of the world's light. It weakens the second band if the
+sum of both could be negative. So the bright side of an object is up to a third too dark, and its dark side is too bright. The group
 multiplies the base colour by the true irradiance divided by Eevee's. Three bands give the true irradiance to a percent (Ramamoorthi and
 Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps").
 """
@@ -81,7 +81,7 @@ def _term(number: int) -> str:
 
 
 def _switch_off_elsewhere(value: bpy.types.NodeSocket) -> None:
-    """Drive a Value node: 1 where the scene is rendered by Eevee, else 0. Blender evaluates so simple an expression without Python."""
+    """Drive a Value node: 1 if Eevee renders the scene, otherwise 0. The expression is so simple that Blender needs no Python for it."""
     driver = value.driver_add("default_value").driver
     variable = driver.variables.new()
     variable.name, variable.type = "engine", "CONTEXT_PROP"
@@ -91,9 +91,10 @@ def _switch_off_elsewhere(value: bpy.types.NodeSocket) -> None:
 
 
 def set_harmonics(tree: bpy.types.ShaderNodeTree, harmonics: Sequence[Sequence[float]], window: float) -> None:
-    """Set the world's light: nine harmonics of its irradiance over π, in linear Rec.709, and Eevee's factor of the second band.
+    """Set the world's light. `harmonics` are nine coefficients (9, 3) of its irradiance over π, in linear Rec.709.
 
-    The order of the harmonics is 1; x, y, z; xy, yz, 3z² − 1, xz, x² − y². Constants are not included.
+    Their order is 1; x, y, z; xy, yz, 3z² − 1, xz, x² − y². They do not include the harmonics' constants, BANDS and THIRD. `window` is the
+    factor by which Eevee weakens the second band.
     """
     constants = (BANDS[0], *[BANDS[1]] * 3, *THIRD)
     for number, (rgb, constant) in enumerate(zip(harmonics, constants, strict=True)):
@@ -103,7 +104,10 @@ def set_harmonics(tree: bpy.types.ShaderNodeTree, harmonics: Sequence[Sequence[f
 
 
 def add_world_diffuse(material: bpy.types.Material, occlusion: bpy.types.NodeSocket | None = None) -> None:
-    """Put the group before the base colour of a material's Principled BSDF. `occlusion` is a socket of the material's tree, if any."""
+    """Insert the group `RefGS World Diffuse` before the base colour of a material's Principled BSDF.
+
+    `occlusion` is the socket in the material's tree that has the occlusion, or None.
+    """
     tree, shader = material.node_tree, principled(material)
     node = add(tree, "ShaderNodeGroup", name=NAME, node_tree=world_diffuse_group())
     for name in ("Base Color", "Metallic", "Normal"):
@@ -120,7 +124,10 @@ def add_world_diffuse(material: bpy.types.Material, occlusion: bpy.types.NodeSoc
 
 
 def surface_inputs(material: bpy.types.Material) -> dict[str, list[bpy.types.NodeSocket]]:
-    """Find the sockets that take a material's base colour, metallic and roughness. Returns them by the Principled BSDF's names."""
+    """Find the sockets that take a material's base colour, metallic and roughness. The material may have this group.
+
+    Returns lists of sockets under the names of the Principled BSDF's inputs, such as "Base Color".
+    """
     shader, node = principled(material), material.node_tree.nodes.get(NAME)
     found = {name: [shader.inputs[name]] for name in ("Base Color", "Metallic", "Roughness")}
     if node is not None:

@@ -74,7 +74,7 @@ def _words(state: str, facts: dict) -> str:
 
 
 def show_table(folder: Path) -> bool:
-    """Copy the rows of a batch into the list that the panel draws, if the file or the batch's state has changed. Returns True if it has."""
+    """Copy the rows of a batch into the list that the panel draws, if its file or state has changed. Return True if rows were copied."""
     global _shown
     try:
         changed = (folder / jobs.LOGS / ROWS).stat().st_mtime_ns
@@ -102,7 +102,7 @@ def is_shown(folder: Path) -> bool:
 
 
 def chosen_row(folder: Path) -> bpy.types.PropertyGroup | None:
-    """Return the row that is selected in the panel's list. Return None if the list is empty or that of another folder."""
+    """Return the row that is selected in the panel's list. Return None if the list is empty, or shows another folder's batch."""
     manager = bpy.context.window_manager
     rows = manager.refgs_rows if is_shown(folder) else ()
     return rows[manager.refgs_row] if 0 <= manager.refgs_row < len(rows) else None

@@ -24,10 +24,10 @@ STEP = 0.35  # sine of the angle between a smooth surface and the line to a neig
 
 
 def chosen_part(splats: bpy.types.Object, active: bpy.types.Object | None) -> np.ndarray | None:
-    """Return the positions (P, 3) of the splats that the artist has chosen, in the splats' coordinates. Returns None if there are none.
+    """Return the positions (P, 3) of the splats that the artist has chosen, in the splats' coordinates. Returns None if none are chosen.
 
-    They are the points that are selected in Edit Mode (see `deleted_splats.add_points`), or those in the box or ball that is the `active`
-    object (see `regions.add_region`).
+    In Edit Mode, these are the selected points (see `deleted_splats.add_points`). Otherwise, they are the splats in the box or ball that is
+    the `active` object (see `regions.add_region`).
     """
     points = points_of(splats)
     if points is not None and points.mode == "EDIT":
@@ -51,8 +51,8 @@ def chosen_part(splats: bpy.types.Object, active: bpy.types.Object | None) -> np
 def part_at(splats: bpy.types.Object, origin: Vector, direction: Vector) -> np.ndarray:
     """Return the positions (P, 3) of the splats of the part that a ray hits first, in the splats' coordinates.
 
-    The ray is in world space. A part ends at creases. Materials do not limit it, because they may be what is wrong. Raises InputError if
-    the ray hits no splat.
+    The ray is in world space. A part ends at creases. Changes of the trained material do not end a part, because that material may be
+    wrong. Raises InputError if the ray hits no splat.
     """
     inverse = _to_world(splats).inverted_safe()
     seed = _hit(splats, np.array(inverse @ origin), np.array(inverse.to_3x3() @ direction))
@@ -71,7 +71,10 @@ def write_hint(file: Path, kind: str, points: np.ndarray) -> None:
 
 
 def _hit(splats: bpy.types.Object, origin: np.ndarray, direction: np.ndarray) -> int | None:
-    """Find the splat at which half of the light along a ray is blocked. If less is blocked, return the last one; None if none is hit."""
+    """Return the index of the splat at which half of the light along a ray is blocked.
+
+    If all splats together block less, return the last one that the ray hits. Return None if it hits no splat.
+    """
     position, scale = (_attribute(splats, name, "vector", 3) for name in ("position", "scale"))
     axes = splat_axes(_attribute(splats, "rotation", "value", 4))
     normal = np.cross(*axes)
@@ -90,10 +93,10 @@ def _hit(splats: bpy.types.Object, origin: np.ndarray, direction: np.ndarray) ->
 
 
 def _smooth_part(splats: bpy.types.Object, seed: int) -> np.ndarray:
-    """Tell which splats (N,) are connected with the splat `seed` by a surface without creases.
+    """Mark the splats (N,) that belong to the same part as the splat `seed`: a surface without creases connects them.
 
-    Neighbours are connected if their normals agree, and if the line between them runs along the surface. Splats most of whose neighbours
-    are in the part belong to it, too.
+    Neighbours are connected if their normals agree, and if the line between them runs along the surface. A splat also belongs to the part
+    if most of its neighbours do. A faint splat belongs to the part if the nearest solid splat does.
     """
     position, normal = (_attribute(splats, name, "vector", 3) for name in ("position", "normal"))
     solid = _attribute(splats, "opacity", "value", 1)[:, 0] >= SOLID
@@ -123,7 +126,7 @@ def _smooth_part(splats: bpy.types.Object, seed: int) -> np.ndarray:
 
 
 def _to_world(splats: bpy.types.Object) -> Matrix:
-    """Return the matrix from the splats' coordinates to world space. `matrix_world` is old while they are hidden and the mesh is shown."""
+    """Return the matrix from the splats' coordinates to world space. Blender does not update `matrix_world` of splats that are hidden."""
     local = splats.matrix_parent_inverse @ splats.matrix_basis
     return splats.parent.matrix_world @ local if splats.parent else splats.matrix_basis.copy()
 

@@ -110,7 +110,7 @@ def add_root(name: str, splats: bpy.types.Object, mesh: list[bpy.types.Object]) 
 
 
 def put_under(meshes: list[bpy.types.Object], splats: bpy.types.Object) -> None:
-    """Let the meshes cast the shadows of the splats, and stand for them in reflections, where `run_parts.show` shows the splats.
+    """Let the meshes cast shadows and appear in reflections in place of the splats, while `run_parts.show` shows the splats.
 
     Each mesh is shrunk a little, because splats inside it would lie in its shadow.
     """
@@ -124,10 +124,10 @@ def put_under(meshes: list[bpy.types.Object], splats: bpy.types.Object) -> None:
 
 
 def trace_rays(scene: bpy.types.Scene) -> None:
-    """Make a scene fit for a run: Eevee traces rays on the screen, unless it does so already, and Cycles passes LAYERS transparent quads.
+    """Make a scene fit for a run: switch on Eevee's ray tracing, and let rays in Cycles pass at least LAYERS transparent quads.
 
-    The object then mirrors and darkens itself in Eevee, too. Rays are traced for each pixel and not denoised: half the resolution, or
-    Blender's denoising, made chrome and glossy paint look dull.
+    The object then mirrors and darkens itself in Eevee, too. Eevee traces a ray for each pixel and does not denoise: half the resolution
+    makes chrome and glossy paint look dull, and so does Blender's denoising. If ray tracing is already on, its options stay.
     """
     if not scene.eevee.use_raytracing:
         scene.eevee.use_raytracing = True
@@ -168,7 +168,7 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
 
 
 def _doubt_words(folder: Path) -> str:
-    """Read the trainer's words on where a run's photos do not tell, from its metrics.json. Returns "" if there are none."""
+    """Read from a run's metrics.json the text that says where photos do not tell metal from paint. Returns "" if there is no such text."""
     try:
         return str(read_json(folder / "metrics.json")["doubt"]["what"])
     except (InputError, KeyError, TypeError):  # not there, of an older release, or half copied
@@ -176,7 +176,7 @@ def _doubt_words(folder: Path) -> str:
 
 
 def _occlusion(material: bpy.types.Material) -> bpy.types.NodeSocket | None:
-    """Find the socket with the occlusion of a material that Blender's glTF importer made. Blender itself does not use it."""
+    """Find the socket that has the occlusion, in a material that Blender's glTF importer made. Blender does not render this occlusion."""
     inputs = (node.inputs.get("Occlusion") for node in material.node_tree.nodes if node.type == "GROUP")
     return next((socket.links[0].from_socket for socket in inputs if socket and socket.links), None)
 

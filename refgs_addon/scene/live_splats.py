@@ -46,7 +46,7 @@ def is_watched(job: jobs.Job) -> bool:
 
 
 def update() -> None:
-    """Replace the shown surfels by those of the newest preview. Remove those of ended trainings. Called by a timer.
+    """Show the surfels of each training's newest preview. Remove the surfels of ended trainings. A timer calls this function.
 
     A background thread reads the files, so that this function returns at once.
     """
@@ -66,7 +66,7 @@ def update() -> None:
 def _read(path: Path) -> dict | None:
     """Read a preview's splats as attributes for `point_cloud`. Returns None if the file cannot be read.
 
-    The normal does not change across a splat here: computing its change would take longer than everything else.
+    Normals are constant across each splat here. Computing how they change would take longer than everything else.
     """
     import numpy as np
 

@@ -11,7 +11,7 @@ from ..preferences import log_file, python
 
 
 def results_folder(scene: bpy.types.Scene) -> Path | None:
-    """Return the folder for the runs: the one that the artist chose, else one beside the captures. Return None if neither is chosen."""
+    """Return the folder for the runs: the artist's choice, or else one beside the captures. Return None if no captures are chosen."""
     settings = scene.refgs.many
     if settings.results:
         return Path(bpy.path.abspath(settings.results))
@@ -22,7 +22,7 @@ def results_folder(scene: bpy.types.Scene) -> Path | None:
 def train_many(scene: bpy.types.Scene) -> jobs.Job:
     """Start a job that trains on all captures of the scene's folder, or resumes such a job. `batch_table` shows its progress.
 
-    Raises InputError if there is no trainer or no such folder, or if a batch works there already.
+    Raises InputError if there is no trainer or no folder of captures, or if a batch is already running in the folder for the runs.
     """
     captures, out = _captures(scene), results_folder(scene)
     if captures is None:

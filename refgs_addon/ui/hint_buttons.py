@@ -11,7 +11,7 @@ from .operators import OnRun, has_trainer
 
 
 class Hint(OnRun, bpy.types.Operator):
-    """Train again with a hint. Without a chosen part, wait for a click on one."""
+    """Train again with a hint. If no part is chosen, wait until the artist clicks on a part."""
 
     bl_idname = "refgs.hint"
     bl_label = "This Part Is"

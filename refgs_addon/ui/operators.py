@@ -177,7 +177,7 @@ class Crop(ReportsErrors, bpy.types.Operator):
 
 
 class _Deletes(ReportsErrors):
-    """Find the splats that an operator deletes or restores, and leave the mode in which points are deleted. Base class."""
+    """Find the splats that an operator deletes or restores, and go back to Object Mode. Base class."""
 
     splats: StringProperty(name="Splats", description="The object")
 

@@ -1,4 +1,4 @@
-"""Make the steps of a training: find cameras, make masks, train, evaluate, export. Each is a command line that can be repeated."""
+"""Make the steps of a training: find cameras, make masks, train, evaluate, export. Each step is a command line, and can be run again."""
 
 import os
 from pathlib import Path
@@ -22,10 +22,10 @@ class Node(NamedTuple):
 
 
 def steps_of(job: Job, out: Path, device: str) -> list[Node]:
-    """List the steps of a training into `out`, each after those that it follows.
+    """List the steps of a training into `out`. A step comes after all steps that it waits for.
 
-    Masks may fail. Then the training reconstructs all that the photos show, as `refgs train` does. No two steps work in a run at once,
-    because a step that locks the run removes files that others are writing, as if killed processes had left them.
+    The step `masks` may fail. The training then reconstructs everything that the photos show. Steps never work in the same run folder at
+    the same time: a step that locks the folder removes half-written files, because it takes them for leftovers of killed processes.
     """
     run, capture, ask = (out / job.name).resolve(), str(job.capture), job.ask
     logs = run.parent / LOGS

@@ -66,9 +66,9 @@ def all_found(source: Path, found: list[tuple[str, Path | None]]) -> list[Path]:
 class Masks:
     """Find the mask file of each photo of a capture.
 
-    The mask of NAME.jpg is NAME.png or NAME.jpg.png in the folder `masks`, or the same with another image suffix. If photos are in
-    subfolders, their masks are in subfolders of `masks` with the same names. If there is no such mask, NAME_alpha.png beside the photo is
-    used, as in the scene `ball` of Shiny Blender.
+    The mask of NAME.jpg is NAME.png or NAME.jpg.png in the folder `masks`. Other image suffixes than .png are allowed. If photos are in
+    subfolders, their masks are in subfolders of `masks` with the same names. If the folder `masks` has no mask of a photo, NAME_alpha.png
+    beside the photo is used, as in the scene `ball` of Shiny Blender.
     """
 
     def __init__(self, folder: Path):
@@ -110,9 +110,10 @@ def photo_view(
 ) -> View:
     """Combine a photo, its camera and its mask in a View.
 
-    `as_given` is the camera and lens from the capture's file. They are scaled if they are for another resolution than the photo's. They are
-    turned upright with the photo if it has an EXIF orientation, because COLMAP and nerfstudio make cameras for photos as stored. A camera
-    whose size only fits the upright photo is not turned. `mask_below` is given if the mask is a depth map (see `View`).
+    `as_given` is the camera and lens from the capture's file. If they are for another resolution than the photo's, they are scaled. If the
+    photo has an EXIF orientation, they are turned upright with the photo, because COLMAP and nerfstudio make cameras for photos as stored.
+    They are not turned if the camera's size already fits the upright photo and not the stored one. `mask_below` is set only for a mask that
+    is a depth map (see `View`).
 
     Raises InputError if the photo's aspect ratio differs from the camera's, or the mask's size from the photo's. `where` is a name for the
     camera in error messages.

@@ -22,8 +22,8 @@ class FirstPoints(NamedTuple):
     """Hold the points at which surfels start, in the capture's space.
 
     `positions` (N, 3); unit `normals` (N, 3); `spacing` (N,), the distance to the nearest points; sRGB `colours` (N, 3) in 0..1, or None if
-    unknown. The first `on_hull` points lie on the visual hull; it is None if there is no hull. `source` tells the user where the points
-    are.
+    unknown. The first `on_hull` points lie on the visual hull; `on_hull` is None if there is no hull. `source` says in words where the
+    points come from.
     """
 
     positions: np.ndarray
@@ -39,9 +39,10 @@ def first_points(
 ) -> FirstPoints:
     """Choose the points at which surfels start.
 
-    If all photos have masks, most points lie on the visual hull of the masks, and come first. The others lie inside the hull, because masks
-    do not show hollows. With `hollows`, the hull is first carved where photos see through it. That needs a light that stands still (see
-    `hollows.carve_hollows`). If any photo has no mask, the points are those of structure from motion, or random.
+    If all photos have masks, most points lie on the visual hull of the masks. These points come first. The others lie inside the hull,
+    because masks do not show hollows. With `hollows`, the hull is first carved where photos see through it to a surface behind
+    (see `hollows.carve_hollows`). This carving needs a light that does not move. If any photo has no mask, the points are those of
+    structure from motion, or random.
     """
     count = min(surfels.start, surfels.budget)
     if all(view.alpha is not None for view in views):
@@ -63,7 +64,8 @@ def _hull_points(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Place `count` points: most on the visual hull of the masks, the others inside it.
 
-    Returns positions, normals, the spacing of the points, and how many are on the hull. These come first.
+    Returns positions (N, 3), unit normals (N, 3), the spacing of the points (N,), and the number of points on the hull. Points on the hull
+    come first.
     """
     cameras = [view.camera for view in views]
     photos = [Photo(view.image, view.alpha, view.camera, view.white) for view in views if view.alpha is not None]
@@ -125,10 +127,10 @@ def _thinned(points: np.ndarray, capture: Capture, count: int, seed: int) -> tup
 
 
 def _random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
-    """Place `count` points at random, evenly in the ball that the cameras look at, or in the region to train if there is one.
+    """Place `count` points at random, evenly in the region to train, or in the ball that the cameras look at if no region was given.
 
-    In a room, or if there is a region to train, up to half of the points are placed farther out, for the surroundings. They are uniform in
-    inverse distance.
+    In a room, or if a region was given, up to half of the points are placed farther out, for the surroundings. These points are uniform
+    in inverse distance.
     """
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))

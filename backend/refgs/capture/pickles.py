@@ -1,8 +1,8 @@
 """Read pickled NumPy arrays safely.
 
 `pickle.load` can call any function that the file names, and captures come from untrusted sources. This reader accepts only the few classes
-and functions that pickled arrays need. It replaces them by its own, which only keep an array's bytes, shape and type. The arrays are made
-from these later. A file that names any other class or function is refused.
+and functions that pickled arrays need. It replaces each one by a class or function of this module, which only keeps an array's bytes, shape
+and type. The array is made later, from these three. A file that names any other class or function is refused.
 """
 
 import io
@@ -99,7 +99,10 @@ _Step = Callable[[pickle.Unpickler], None]
 
 
 class _Arrays(pickle._Unpickler):
-    """Read a pickle in Python, by the classes and functions of `_NAMES` alone. Reading in C, a few bytes could reserve gigabytes."""
+    """Read a pickle with only the classes and functions in `_NAMES`.
+
+    Python's reader is used, because a few bytes could make C's reader reserve gigabytes.
+    """
 
     read: Callable[[int], bytes]  # `load` sets these two
     append: Callable[[object], None]

@@ -1,7 +1,7 @@
 """Read priors: normals and depth that other programs guessed from single photos. Training uses them only early.
 
-They are files in the folders `normals` and `depth`, beside the folder `masks`. A file has its photo's name, as a mask has. Words that such
-programs append are allowed, as in `0001_pred.npy` for the photo `0001.jpg`.
+Priors are files in the folders `normals` and `depth`, beside the folder `masks`. A prior has the name of its photo, like a mask. Words that
+the other program appended to the name are ignored, as in `0001_pred.npy` for the photo `0001.jpg`.
 """
 
 import re
@@ -41,9 +41,9 @@ class Prior(NamedTuple):
 
 
 def with_priors(views: list[View], root: Path) -> list[View]:
-    """Add the paths of priors to the training views. The folders `normals` and `depth` are looked for in the folder `root`.
+    """Add the paths of priors to the training views. The folder `root` has the folders `normals` and `depth`, if there are priors.
 
-    No file is opened. Files that have no photo's name are ignored.
+    No file is opened. A file whose name fits no photo is ignored.
     """
     for folder, field in FOLDERS.items():
         if (root / folder).is_dir():
@@ -53,10 +53,10 @@ def with_priors(views: list[View], root: Path) -> list[View]:
 
 
 def _find(views: list[View], root: Path, folder: Path) -> dict[View, Path]:
-    """Return the file of each training view that has one in `folder`. If it has several, the one whose suffix is first in SUFFIXES counts.
+    """Find the prior of each training view in `folder`. Return {view: file}, without views that have no prior.
 
-    As for masks, the first folder of a photo's path may be left out: `0001.png` is for `images/0001.jpg`. A file is not used if its name
-    fits two training photos, or if it fits only a held-out photo.
+    If a view has several files, the one whose suffix comes first in SUFFIXES is taken. As for masks, the first folder of a photo's path may
+    be left out: `0001.png` is for `images/0001.jpg`. A file is not used if its name fits two training photos, or only a held-out photo.
     """
     named: dict[str, list[View]] = {}
     for view in sorted(views, key=lambda view: view.split != "train"):
@@ -82,9 +82,9 @@ def _preference(file: Path) -> tuple[int, int]:
 
 
 def load_normals(view: View) -> Prior | None:
-    """Load the guessed normals of a view as unit vectors (H, W, 3), or return None if it has none.
+    """Load the guessed normals of a view as unit vectors (H, W, 3). Return None if the view has no such file.
 
-    They have the file's axes, which are not known: x may point right or left, and so on. Raises InputError naming the file.
+    The directions of the file's axes are not known: x may point right or left, and so on. Raises InputError naming the file.
     """
     path = view.prior_normals
     if path is None:
@@ -104,9 +104,9 @@ def load_normals(view: View) -> Prior | None:
 
 
 def load_depth(view: View) -> Prior | None:
-    """Load the guessed depth or disparity of a view (H, W), or return None if it has none.
+    """Load the guessed depth or disparity of a view (H, W). Return None if the view has no such file.
 
-    Its scale and its zero point are not known. The value 0 means that nothing is known. Raises InputError naming the file.
+    The scale and the zero point of the values are not known. Unknown pixels are 0. Raises InputError naming the file.
     """
     path = view.prior_depth
     if path is None:
@@ -119,9 +119,9 @@ def load_depth(view: View) -> Prior | None:
 
 
 def _read(path: Path, channels: int) -> np.ndarray:
-    """Read a file with `channels` numbers per pixel as float32 (H, W, 3), or (H, W) for one. Values not finite or transparent become 0.
+    """Read a prior's file as float32: (H, W, 3) if `channels` is 3, or (H, W) if it is 1.
 
-    Integers are divided by the largest value of their type.
+    Integers are divided by the largest value of their type. Values that are not finite become 0, and so do transparent pixels.
     """
     if path.suffix.lower() in (".npy", ".npz"):
         values = _read_array(path, channels)
@@ -144,7 +144,7 @@ def _read(path: Path, channels: int) -> np.ndarray:
 
 
 def _read_array(path: Path, channels: int) -> np.ndarray:
-    """Read NumPy's file of one array as float32 (H, W, C). The array may be (C, H, W), and have more axes of length 1."""
+    """Read an array from a NumPy file as float32 (H, W, C). In the file, its shape may be (C, H, W), and have more axes of length 1."""
     try:
         loaded = np.load(path, allow_pickle=False)
         if not isinstance(loaded, np.ndarray):
@@ -164,7 +164,11 @@ def _read_array(path: Path, channels: int) -> np.ndarray:
 
 
 def _fitted(path: Path, view: View, values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, Camera]:
-    """Reduce a prior to at most SIDE pixels, and undistort it as its photo. Return it, where it is known, and the camera for its size."""
+    """Reduce a prior to at most SIDE pixels on its longer side, and undistort it like its photo.
+
+    Returns the new values, a mask (H, W) of known pixels, and the photo's camera for this size. Raises InputError if the prior has another
+    aspect ratio than the photo.
+    """
     height, width = known.shape
     camera = view.camera
     if abs(width / height * camera.height / camera.width - 1) > SHAPE:

@@ -75,7 +75,10 @@ def read_files(folder: Path) -> CaptureFiles:
 
 
 def to_run_frame(files: CaptureFiles, wanted: RegionSettings | None = None) -> Capture:
-    """Convert a capture that `read_files` has read to the run's frame. `wanted` is as for `read_capture`. Some masks are read."""
+    """Convert a capture that `read_files` has read to the run's frame. `wanted` is as for `read_capture`.
+
+    This reads some masks, to find the region of interest.
+    """
     folder, layout, points = files.folder, files.layout, files.points
     views, silhouettes, white = _silhouettes(files.views)
     up = up_direction(views)

@@ -1,9 +1,10 @@
-"""Find an object's silhouettes in photos with known cameras: what has the object's colours, and agrees with a carved shape.
+"""Find an object's silhouettes in photos with known cameras: the pixels that have the object's colours, and agree with a carved shape.
 
 Photos are segmented together (after Campbell et al. 2010, "Automatic 3D object segmentation in multiple views").
-A grid of voxels holds the probability that the object is there. In turns, colour histograms of object and surroundings are learned from the
-voxels' projection, and voxels are kept where nearly all photos show the object's colours. GrabCut (OpenCV) then finds the exact edges.
-What is seen through a hole looks like the surroundings from neighbouring places, too. A highlight does not: it wanders over the surface.
+A grid of voxels holds the probability that the object is there. Two steps alternate: the colour histograms of object and surroundings are
+learned from the voxels' projection; and voxels are kept where nearly all photos show the object's colours. GrabCut (OpenCV) then finds the
+exact edges. A voxel in a hole of the object shows the surroundings' colours in neighbouring photos, too. A voxel in a highlight does not,
+because the highlight moves over the surface.
 """
 
 from dataclasses import dataclass
@@ -34,9 +35,10 @@ LEVELS = (20, 32, 32)  # bins of the histograms, in Lab
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """Reduced photo: `image` (H, W, 3) uint8 RGB, its pinhole `camera`, and what is `known` (H, W) int8: 1 object, −1 not, 0 nothing.
+    """Hold a reduced photo: `image` (H, W, 3) uint8 RGB, and its pinhole `camera`.
 
-    `salient` (H, W) is the probability of the object by a model. With it, colours are not asked.
+    `known` (H, W) int8 is 1 where the pixel is known to show the object, −1 where it is known not to, and 0 elsewhere. `salient` (H, W), if
+    given, is the probability of the object that a segmentation model computed. It then replaces the evidence from colours.
     """
 
     image: np.ndarray
@@ -54,7 +56,11 @@ class Photo:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Carved shape: `occupied` (GRID³,) in 0..1 at the points of `box.grid(GRID)`, the number of separate `objects`, and the colours."""
+    """Hold a carved shape: `occupied` (GRID³,) is its probability at the points of `box.grid(GRID)`.
+
+    `objects` is the number of separate objects. `colors` are the histograms of the object's and of the surroundings' colours. `backdrop` is
+    the plane that carries the object, or None.
+    """
 
     box: Box
     occupied: np.ndarray
@@ -63,9 +69,9 @@ class Shape:
     backdrop: Backdrop | None
 
     def bounds(self, to_frame: np.ndarray) -> Box:
-        """Return the box, parallel to the axes, about the shape in other coordinates, with a margin of a twentieth.
+        """Return the axis-parallel box around the shape in other coordinates, with a margin of 5 % of its size on each side.
 
-        `to_frame` (4, 4) is p_new = to_frame @ p.
+        `to_frame` (4, 4) converts points to these coordinates: p_new = to_frame @ p.
         """
         points = self.box.grid(GRID)[self.occupied > 0.5] @ to_frame[:3, :3].T + to_frame[:3, 3]
         low, high = points.min(axis=0), points.max(axis=0)
@@ -81,8 +87,8 @@ class Shape:
 def carve_object(photos: list[Photo], box: Box, fill: float, backdrop: Backdrop | None, progress) -> Shape | None:
     """Carve the object in a box out of the photos. Return None if nothing is left.
 
-    At first the object is taken for an ellipsoid in the box, which fills the part `fill` of it. `backdrop` is the plane that carries it,
-    or None; its texture is learned here, unless the photos are `salient`. `progress(done, total)` is called after each round.
+    The first guess is an ellipsoid, whose axes are the fraction `fill` of the box's edges. `backdrop` is the plane that carries the object,
+    or None. The plane's colours are learned here, unless photos have `salient`. `progress(done, total)` is called after each round.
     """
     points = box.grid(GRID)
     centred = np.linalg.norm(np.linalg.solve(box.matrix[:3, :3], (points - box.centre).T), axis=0)
@@ -170,7 +176,7 @@ def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
 def _only_connected(mask: np.ndarray, solid: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Drop the parts of a mask that do not touch the shape's projection `solid`, and close the holes that the shape does not have.
 
-    Such holes are highlights. What strokes say (`known`) stays.
+    The closed holes are highlights, which GrabCut took for surroundings. Pixels that the user's strokes fix (`known`) do not change.
     """
     _, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     kept = np.isin(parts, np.unique(parts[(mask > 0) & (solid | (known > 0))])) & (mask > 0)
@@ -181,7 +187,7 @@ def _only_connected(mask: np.ndarray, solid: np.ndarray, known: np.ndarray) -> n
 
 
 def _neighbours(photos: list[Photo], centre: np.ndarray) -> np.ndarray:
-    """Return the pairs (N, 2) of each photo and the nearest one that looks at `centre` from another direction: by 5° to 40°."""
+    """Pair each photo with the one whose direction to `centre` differs least, but by 5° to 40°. Return indices of photos (N, 2)."""
     away = np.array([photo.camera.position for photo in photos]) - centre
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     angle = np.degrees(np.arccos(np.clip(away @ away.T, -1, 1)))
@@ -200,13 +206,16 @@ def _pixels(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _footprint(box: Box, camera: Camera) -> float:
-    """Return the size of a voxel at the box's centre, in pixels."""
+    """Return how many pixels wide a voxel at the box's centre is in the photo."""
     depth = max(float((camera.world_to_camera @ [*box.centre, 1])[2]), 1e-6)
     return 2 * np.linalg.norm(box.matrix[:3, :3], axis=0).max() / (GRID - 1) * camera.fx / depth
 
 
 def _project_voxels(occupied: np.ndarray, box: Box, camera: Camera, at: np.ndarray | None = None) -> np.ndarray:
-    """Return the largest value of the voxels along each pixel's ray, (H, W) float32, smooth over a voxel's size."""
+    """Return the largest value of the voxels along each pixel's ray, (H, W) float32, blurred by about the size of a voxel.
+
+    `at` may give the result of `_pixels` for all voxels, so that it is not computed again.
+    """
     width, height = camera.width, camera.height
     # Voxels of several pixels are drawn in a smaller picture, in which they leave no gaps.
     step = max(1.0, _footprint(box, camera))
@@ -226,20 +235,21 @@ def _histogram(bins: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def _hidden(prior: np.ndarray) -> np.ndarray:
-    """Mark the pixels (H, W) that may show the object, by the shape's projection, with a margin."""
+    """Mark the pixels (H, W) at which the object may hide the plane: the shape's projection with a margin."""
     margin = max(3, round(0.02 * max(prior.shape))) | 1
     return cv2.dilate((prior > 0.3).astype(np.uint8), np.ones((margin, margin), np.uint8)) > 0
 
 
 def _plain(photo: Photo, prior: np.ndarray, backdrop: Backdrop | None) -> np.ndarray | None:
-    """Return how likely the bare plane has each pixel's colour, NaN where it is not known; None without a plane."""
+    """Return how well each pixel's colour fits the bare plane (H, W), as `Backdrop.likelihood`. Return None if there is no plane."""
     return None if backdrop is None else backdrop.likelihood(photo.image, photo.camera, _hidden(prior))
 
 
 def _surroundings(ours: np.ndarray, theirs: np.ndarray, plain: np.ndarray | None) -> np.ndarray:
-    """Return how likely the surroundings have each pixel's colour, (H, W): by the histogram, and by the bare plane.
+    """Return the likelihood of each pixel's colour in the surroundings, (H, W).
 
-    `ours` and `theirs` (H, W) are by the histograms, `plain` is `Backdrop.likelihood`.
+    `ours` and `theirs` (H, W) are its likelihoods by the histograms of the object and of the surroundings. `plain` is the result of
+    `Backdrop.likelihood`, or None without a plane. Where it is NaN, the result is `theirs`.
     """
     if plain is None:
         return theirs
@@ -250,10 +260,11 @@ def _surroundings(ours: np.ndarray, theirs: np.ndarray, plain: np.ndarray | None
 def _weights(
     photo: Photo, prior: np.ndarray, plain: np.ndarray | None, colors: tuple[np.ndarray, np.ndarray] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return each pixel's weight (H, W) in the colours of the object, and in those of the surroundings.
+    """Return two weights of each pixel (H, W): in the histogram of the object's colours, and in that of the surroundings'.
 
-    Where `colors` are known, pixels of the surroundings' colours count less as the object's: the shape may close a hole. A band about the
-    shape belongs to neither. A part of the object that is not in the shape yet must not make its colours the surroundings'.
+    A pixel in the shape has a smaller weight if its colour fits the surroundings better, by the histograms `colors`: the shape may wrongly
+    close a hole there. Pixels in a band around the shape have no weight in either histogram. The shape may still lack parts of the object,
+    and their colours must not be learned as the surroundings'.
     """
     ours = prior * (prior > 0.5)
     if colors is not None:
@@ -276,7 +287,10 @@ def _learn_colors(
     plains: list[np.ndarray | None],
     before: tuple[np.ndarray, np.ndarray] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the histograms of the object's and of the surroundings' colours, the mean over the photos. `before` are the last round's."""
+    """Return two histograms, averaged over the photos: of the object's colours, and of the surroundings'.
+
+    `before` are the histograms of the last round, or None in the first.
+    """
     pairs = [
         [_histogram(photo.bins, weight) for weight in _weights(photo, prior, plain, before)]
         for photo, prior, plain in zip(photos, priors, plains, strict=True)
@@ -289,7 +303,8 @@ def _posterior(
 ) -> np.ndarray:
     """Return the probability that each pixel shows the object.
 
-    It is by the colours of all photos and of this one, and by the bare plane's, or by the model; and by the shape's projection.
+    Two sources are combined. One is the shape's projection `prior`. The other is the model's probability, if the photo has `salient`, or
+    else the pixel's colour: how well it fits the histograms of all photos, those of this photo, and the bare plane.
     """
     evidence = _of_colors(photo, prior, plain, colors) if photo.salient is None else _of_model(photo.salient)
     odds = np.clip(prior, 0.1, 0.9)
@@ -305,7 +320,7 @@ def _of_model(salient: np.ndarray) -> np.ndarray:
 def _of_colors(
     photo: Photo, prior: np.ndarray, plain: np.ndarray | None, colors: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
-    """Return the logarithm of the odds that each pixel's colour is the object's, (H, W)."""
+    """Return the logarithm of the odds that each pixel shows the object, by its colour, (H, W)."""
     ours, theirs = (_histogram(photo.bins, weight) for weight in _weights(photo, prior, plain, colors))
     ours = 0.5 * colors[0] + 0.5 * ours
     theirs = 0.3 * colors[1] + 0.7 * theirs if theirs.any() else colors[1]

@@ -1,8 +1,9 @@
-"""Find photos that show the same, by their image features.
+"""Find photos that show the same part of a scene, by their image features.
 
-A photo is described by one vector (VLAD: Jégou et al. 2010; normalised as by Arandjelović and Zisserman 2013). Its features are assigned to
-WORDS means of all photos' features, and how far they are from their means is summed for each mean. The means are made of the photos
-themselves, so that nothing is downloaded. This takes milliseconds a photo; matching the features of two photos takes tenths of a second.
+A photo is described by one vector (VLAD: Jégou et al. 2010; normalised as by Arandjelović and Zisserman 2013). Each feature is assigned to
+the nearest of WORDS means of all photos' features. For each mean, the vector holds the sum of the differences between its features and
+the mean. The means are made of the photos themselves, so that nothing is downloaded. A vector takes milliseconds; matching the features of
+two photos takes tenths of a second.
 """
 
 from collections.abc import Callable
@@ -20,8 +21,9 @@ def similar_pairs(read: Callable[[int], np.ndarray], count: int, beside: int) ->
     """Pair each of `count` photos with others that look like it. Return pairs of indices, the smaller one first.
 
     `read(index)` returns the descriptors of a photo's features, (M, D) of any dtype. It is called twice for each photo. Photos at most
-    `beside` places from each other are not paired. RANKS are ever further apart: where photos are many, the most alike ones are all
-    neighbours, and would leave no place for other rounds around the object. The result is the same for the same photos.
+    `beside` places from each other are not paired. The others are ranked by likeness, and those at the RANKS are chosen. These ranks have
+    gaps: among many photos, the most similar ones are all neighbours, and photos of other rounds around the object would not be chosen. The
+    same photos always give the same pairs.
     """
     random = np.random.default_rng(0)
     sample = np.concatenate([random.permutation(read(index))[:SAMPLE] for index in range(count)])
@@ -44,7 +46,7 @@ def _unit(rows: np.ndarray) -> np.ndarray:
 
 
 def _describe(features: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Return the vector (WORDS · D,) of a photo with these features (M, D), of length 1, or of zeros if there are none."""
+    """Return the unit vector (WORDS · D,) that describes a photo with these features (M, D). It is zero if there are no features."""
     word = np.argmax(features @ means.T - (means**2).sum(axis=1) / 2, axis=1)
     sums = np.zeros_like(means)
     np.add.at(sums, word, features - means[word])

@@ -18,7 +18,7 @@ TOLD, DOUBTFUL = (0.33, 0.35, 0.38), (1.0, 0.6, 0.15)  # sRGB: where photos tell
 def composite(view: LoadedView, background: Tensor) -> Tensor:
     """Composite a photo over a background colour (3,). Return sRGB-encoded floats (H, W, 3) in 0..1.
 
-    What is brighter than white is clipped. A photo without alpha is not changed otherwise.
+    Values brighter than white are clipped. A photo without alpha is only clipped.
     """
     image = torch.from_numpy(view.encoded).to(background.device).clamp_max(1)
     if view.alpha is None:
@@ -57,7 +57,7 @@ def picture(name: str, value: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     - albedo: sRGB-encoded
     - normal: n/2 + 1/2; black where `alpha` is 0.5 or less
     - depth: divided by its maximum
-    - doubt: from TOLD, where it is 0, to DOUBTFUL, where it is 1; black where `alpha` is 0.5 or less
+    - doubt: the colour TOLD for 0, DOUBTFUL for 1, mixed in between; black where `alpha` is 0.5 or less
     - others: only converted from 0..1 to 8 bits
     """
     if name == "color":

@@ -48,7 +48,9 @@ def compare(mesh: Mesh, truth: Mesh, cameras: list[Camera]) -> dict[str, float]:
 
 
 def seen(mesh: Mesh, points: np.ndarray, cameras: list[Camera], offset: float) -> np.ndarray:
-    """Test which points (P, 3) on a mesh at least one camera sees, without the mesh in between. Returns bool (P,).
+    """Return bool (P,): true for the `points` (P, 3) on a mesh that at least one camera sees.
+
+    A camera sees a point if the point is in its picture, and if the mesh does not hide it.
 
     Rays run from the points to the cameras. They start at the distance `offset` from the point, so that they do not hit the surface there.
     """

@@ -24,9 +24,9 @@ _NEIGHBOURS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, 
 def bake(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress = lambda done, total: None) -> Textures:
     """Bake the textures of a mesh, `size` texels on each side, from the splats around it.
 
-    Each texel has a point on the mesh. Base colour, metallic, roughness, normal, and doubt if the splats have one, come from `composite` at
-    this point, occlusion from `openness`. A texel just outside a chart (a connected piece of the uv layout) has a point on the plane of the
-    nearest face. `progress` is called with the number of points done and their total.
+    Each texel has a point on the mesh. At this point, `composite` computes base colour, metallic, roughness and normal, and doubt if the
+    splats have that value. `openness` computes occlusion. A texel just outside a chart (a connected piece of the uv layout) has a point on
+    the plane of the nearest face. `progress` is called with the number of points done and their total.
     """
     coarse = _composited(mesh, splats, size, progress)
     tangents, signs = vertex_tangents(mesh)
@@ -137,11 +137,11 @@ def _rasterise(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the face and the point of the mesh for each texel in `rows` of a texture. R is the number of rows, S is `size`.
 
-    Returns the index of the face (R, S), −1 if none, the barycentric weights in it (R, S, 3), and the point (R, S, 3). `scene` is the
-    result of `_uv_scene`.
+    Returns three arrays: the index of the face (R, S), −1 where there is none; the barycentric weights in the face (R, S, 3); and the point
+    (R, S, 3). `scene` is the result of `_uv_scene`.
 
-    A texel just outside a chart copies the face and the weights of a neighbour inside. Its point is not copied. It is computed at the
-    texel's own place, on the plane of the face. So weights and point of such a texel do not agree.
+    A texel just outside a chart copies the face and the weights of a neighbour inside. Its point is not copied, but computed at the texel's
+    own place on the plane of the face. So the weights of such a texel do not give its point.
     """
     first, last = max(rows.start - 1, 0), min(rows.stop + 1, size)
     y, x = np.mgrid[first:last, :size].astype(np.float32) + np.float32(0.5)

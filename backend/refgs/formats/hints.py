@@ -16,7 +16,7 @@ KINDS = get_args(Kind)
 
 
 class Hint(NamedTuple):
-    """Hold the `kind` of a part of the surface. `points` (P, 3) are the positions of its splats, in the run's frame."""
+    """Hold a hint: one part of the surface is of this `kind`. `points` (P, 3) are the part's splats, as positions in the run's frame."""
 
     kind: Kind
     points: np.ndarray

@@ -63,7 +63,7 @@ class _Cameras(Model):
     @model_validator(mode="before")
     @classmethod
     def _share(cls, data: Any) -> Any:
-        """Complete each frame by the intrinsics at the file's top level."""
+        """Copy the intrinsics at the file's top level into each frame that does not give them itself."""
         if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
             return data
         shared = {key: data[key] for key in Intrinsics.model_fields if key in data}
@@ -72,7 +72,7 @@ class _Cameras(Model):
 
 
 class Transforms(_Cameras):
-    """Hold the cameras of a file, and what nerfstudio and instant-ngp say besides."""
+    """Hold the cameras of a file, and the values that only nerfstudio, instant-ngp or a run writes."""
 
     frames: list[Frame]
     train_filenames: list[str] | None = None
@@ -89,7 +89,7 @@ class Transforms(_Cameras):
 
 
 class RunFrame(Frame):
-    """Hold a camera of a run. The scene's radiance times `exposure`, one factor or one each for red, green and blue, gives the photo's."""
+    """Hold a camera of a run. The photo's radiance is the scene's, times `exposure`: one number, or one each for red, green and blue."""
 
     split: Literal["train", "test"] = "train"
     exposure: Positive | Vector = 1.0
@@ -116,7 +116,7 @@ class NovelCameras(_Cameras):
 
 
 def read_transforms(file: Path) -> Transforms:
-    """Read cameras from a JSON file of this format. Raises InputError naming the file, the frame and the value that is wrong."""
+    """Read a JSON file of cameras, whichever program wrote it. Raises InputError naming the file, the frame and the value that is wrong."""
     return read_json(file, Transforms, AGAIN)
 
 

@@ -1,4 +1,4 @@
-"""Tell where masks show an object's surface, by how long the rays at its outlines touch the visual hull.
+"""Tell where masks show an object's surface: where rays through its outlines touch the visual hull on a short length only.
 
 A ray through a photo's outline touches the object somewhere. If it touches the hull only near one point, the surface is there. If it runs
 along the hull, as over a bowl's lid or along a flat face, the surface may be anywhere below.
@@ -21,8 +21,8 @@ ACROSS = 200  # pixels across the object, in the reduced masks
 def contact(shape: Shape, alphas: Sequence[np.ndarray], cameras: Sequence[Camera]) -> np.ndarray:
     """Measure how well outlines show the surface at each voxel. Returns (X, Y, Z) in world units; smaller is better.
 
-    The value is half of the length for which a ray at an outline touches the shape there. If several rays do, the least value counts. It is
-    infinite where no such ray passes.
+    Rays run from the cameras through the outlines of the masks. A voxel's value is half the length on which a ray through it runs in the
+    shape. If several rays pass the voxel, the least of their values counts. The value is infinite if no ray passes.
     """
     centre, radius = shape.ball
     step = STEP * float(shape.voxel.min())

@@ -33,7 +33,7 @@ def fuse(
     """Fuse depth maps into a mesh, inside the cube of half-side `radius` about `centre`, on a grid of `resolution`³ voxels.
 
     `depths` (H, W) are distances along the camera's axis in world units, already divided by alpha. `alphas` (H, W) are in 0..1,
-    or booleans: at least a half. All are on the same device. Most of the work is done on this device.
+    or booleans that say whether alpha is at least 0.5. All tensors are on the same device. Most of the work is done on this device.
 
     - A pixel with alpha below 0.5 is background: space along its whole ray is empty. So the silhouettes carve the mesh. For photos without
       masks, alpha is 1 and nothing is carved.

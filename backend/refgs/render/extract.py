@@ -23,10 +23,10 @@ NEARLY_ALL = 0.99  # of the surfels: what the cube holds
 def extract(
     surfels: Surfels, cameras: Sequence[Camera], near: float, centre: np.ndarray, radius: float, resolution: int
 ) -> tuple[Mesh, float]:
-    """Fuse depth maps of the surfels from all cameras into a mesh. Return it, not yet cleaned, and the width of a voxel.
+    """Fuse depth maps of the surfels from all cameras into a mesh. Return the mesh, not yet cleaned, and the width of a voxel.
 
     Only surfels in the foreground are drawn. These are all surfels in the region of interest, which is the ball of `radius` about `centre`.
-    Surfels within twice that radius belong to it too if at least half of the cameras have them in the picture.
+    A surfel within twice that radius belongs to the foreground, too, if at least half of the cameras have it in the picture.
 
     `resolution` is the number of voxels across the foreground. There are fewer if voxels would be narrower than a typical pixel at the
     surface. Surfels nearer to a camera than `near` (world units) are not drawn.

@@ -39,7 +39,8 @@ Step = Callable[[int, str, int], None]
 def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None, step: Step) -> dict[str, Any]:
     """Compare a run with the photos of `views`, and with ground truth if it is given. Returns the metrics for metrics.json, such as PSNR.
 
-    Ground truth of a published data set is compared by the data set's protocol, too, and relit by it alone (`refgs.report.published`).
+    If the ground truth is of a published data set, the run is also measured by that data set's protocol (`refgs.report.published`). Only
+    the protocol then renders views under other lights.
 
     Writes pictures into the run's folder: of the views to pictures/`split`, of the light to pictures/, and of the views under other lights
     to pictures/relight. `split` is "test" for held-out views. After each rendering, `step` is called with the number of renderings that are
@@ -131,7 +132,7 @@ def _measure_view(
 
 
 def _doubt(run: Run, camera: Camera) -> np.ndarray:
-    """Render the doubt of the splats' metallic (H, W), 0..1, as a camera sees it. The splats must have one."""
+    """Render the doubt of the splats' metallic (H, W), 0..1, as a camera sees it. The splats must have that value."""
     feature = torch.from_numpy(run.splats.doubt)[:, None]
     drawn = rasterize(*discs(run.surfels(), camera), feature, camera, near=run.near)
     return (drawn.features[..., 0] / drawn.alpha.clamp_min(COVERED)).numpy()
@@ -164,9 +165,10 @@ def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[
 def _measure_relit(
     run: Run, hdri: str, cameras: list[Camera], truth: GroundTruth, pictures: Path, next_step: Callable[[str], None]
 ) -> dict[str, float]:
-    """Render the views under another light and compare them with ground truth. Writes both as pictures and returns the metrics.
+    """Render the views under another light and compare them with ground truth. Returns the metrics.
 
-    `hdri` names the light in the folder of ground truth. `next_step` is called with a note after each view.
+    Writes the renderings and the ground truth as pictures. `hdri` names the light in the folder of ground truth. `next_step` is called with
+    a note after each view.
     """
     light = run.light(truth.panorama(f"relight/{hdri}"))
 

@@ -19,7 +19,7 @@ class Stage(NamedTuple):
 
     @property
     def cost(self) -> float:
-        """Return how long an iteration takes, in iterations on full photos."""
+        """Return the time of an iteration, as a fraction of the time of an iteration on full photos."""
         return self.factor ** (-2 * BY_PIXELS)
 
 
@@ -30,8 +30,8 @@ def iterations_time(growth: float, progress: float, stages: tuple[Stage, ...] = 
     """Compute how long all iterations up to a progress of 0..1 take together.
 
     Iterations slow down: the last takes `growth` times as long as the first, if both are on full photos. If all were as fast as the first
-    on full photos, the whole training would take 1 unit of time. The result is in this unit, so that it is more than 1 for a progress of 1
-    if photos are not reduced.
+    on full photos, the whole training would take 1 unit of time. The result is in this unit. At a progress of 1, it is at most `growth`,
+    and at least 1 if photos are not reduced.
     """
     first, last = GROWS
 

@@ -45,8 +45,8 @@ def picture(state: State, view: int, inputs: RenderInputs, whole: bool = False) 
 class Lost(NamedTuple):
     """Hold how many dB of PSNR the training views lose by a change of what is rendered.
 
-    `whole` is the loss over all of the object's pixels. `part` is the loss over the hundredth of them (PART) in which the pictures change
-    most: a small part of the object may need what the rest of it does not.
+    `whole` is the loss over all of the object's pixels. `part` is the loss over the fraction PART of these pixels that changes most: a
+    small part of the object may need something that the rest does not.
     """
 
     whole: float
@@ -59,10 +59,10 @@ def decibels_lost(errors: Tensor, without: Tensor) -> float:
 
 
 def lost(views: Iterable[tuple[Tensor, Tensor, Tensor]]) -> Lost:
-    """Compute how much worse the second of two pictures of each view is.
+    """Compute how many dB of PSNR are lost from the first to the second of two pictures of each view.
 
     Each of `views` is (picture, changed picture, photo), all encoded pixels (P, 3) of the object. The pixels of `Lost.part` are those in
-    which the two pictures differ most, whichever of them is nearer to the photo, so that chance favours neither. `views` may be a
+    which the two pictures differ most. This does not depend on the photo, so that chance favours neither picture. `views` may be a
     generator: only three numbers per pixel are kept.
     """
     rows = []
@@ -83,7 +83,7 @@ def spread_views(state: State, most: int = VIEWS) -> list[int]:
 def on_object(state: State, surfels: Surfels, view: int) -> Tensor:
     """Tell which pixels (H, W) of a training view's crop show the object: those in the mask and in the region to train.
 
-    If there is neither a mask nor a region, all do.
+    If there is neither a mask nor a region, all pixels show the object.
     """
     photo = state.photo(view)
     shown = torch.ones(photo.image.shape[:2], dtype=torch.bool, device=state.device)
@@ -111,7 +111,7 @@ def psnr_loss(state: State, change: Change, inputs: RenderInputs | None = None) 
 def _on_object(
     state: State, inputs: RenderInputs, views: list[int], pairs: Iterable[Sequence[Tensor]]
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Cut the object's pixels (P, 3) out of pairs of pictures of the `views`. Yields them with those of the photos."""
+    """Cut the object's pixels (P, 3) out of pairs of pictures of the `views`. Yields (one, other, photo)."""
     for view, (one, other) in zip(views, pairs, strict=True):
         shown = on_object(state, inputs.surfels, view)
         yield one[shown], other[shown], state.photo(view).over(state.background)[shown]
@@ -123,7 +123,7 @@ def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: b
 
     Time two iterations: one without the change, and one with it. The optimiser's step is not timed. Both render only the crop of the photo
     that the training uses. If `whole` is true, the first one renders the whole photo, so that the result includes what cropping saves.
-    Photos are in full size; iterations on reduced photos count less.
+    Both use photos of full size. Remaining iterations on reduced photos are counted as shorter.
     """
     fastest = [math.inf, math.inf]
     for _ in range(REPEATS):
@@ -161,7 +161,7 @@ def mirrored_and_mean(state: State, inputs: RenderInputs, views: list[int]) -> I
 def specular_explains(state: State) -> Lost:
     """Compute how many dB of PSNR the training views lose if reflections no longer change with the view.
 
-    This is what only specular shading can explain (see `mirrored_and_mean`).
+    Only specular shading can explain this loss (see `mirrored_and_mean`).
     """
     inputs, some = state.inputs(), spread_views(state, SEVERAL)
     return lost(_on_object(state, inputs, some, mirrored_and_mean(state, inputs, some)))
@@ -186,7 +186,7 @@ def reflections_explain(state: State) -> Lost:
     """Estimate how many dB of PSNR the training views can gain from inter-reflection at most.
 
     Two pictures are compared. Where the object mirrors itself, one picture shows black there, and the other shows the environment's light.
-    The correct picture lies between the two, so that their difference limits the gain. The result is how many dB the PSNR falls if this
+    The correct picture lies between the two, so the gain is at most their difference. The result is how many dB the PSNR falls if this
     difference is added to the error against the photos.
     """
     inputs, wrong, apart = state.inputs(), [], []

@@ -40,7 +40,7 @@ class Means(Part):
 
     @property
     def psnr(self) -> float:
-        """Return the PSNR on training views, in dB, of the mean squared error."""
+        """Return the PSNR of the training views in dB, from the mean squared error."""
         return decibels(float(self.values["square"]))
 
 

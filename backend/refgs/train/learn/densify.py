@@ -22,7 +22,7 @@ LEAST_LEFT = 1000
 
 
 class Densification(Part):
-    """Remember the mean gradient of each surfel on the screen, which says which surfels to divide."""
+    """Remember each surfel's mean screen gradient, which tells which surfels to divide (see `ScreenGradient`)."""
 
     name = "densification"
 
@@ -45,7 +45,7 @@ class Densification(Part):
 
 
 def watch(state: State, step: Step, accepted: Tensor) -> None:
-    """Add this view's gradients of the positions to their mean on the screen, if the step is `accepted`."""
+    """Add this view's gradients of the positions to the mean screen gradients. Add nothing if `accepted`, a scalar, is 0."""
     position, gradient = state.learned["position"], state.part(Densification).gradient
     if position.grad is not None:
         gradient.add(position.detach(), position.grad, state.photos[step.view].camera, accepted)
@@ -145,10 +145,9 @@ def fewer_surfels(state: State) -> None:
 
 
 def _divide(learned: Learned, first: Tensor, second: Tensor) -> None:
-    """Make two halves of each divided surfel, so that together they cover what it covered.
+    """Turn the two copies of each divided surfel into halves that together cover as much as the surfel did.
 
-    The rows `first` and `second` hold two equal copies of each surfel. Move the copies apart along the longer axis, and
-    shorten them along it.
+    The rows `first` and `second` hold the copies. Move them apart along the surfel's longer axis, and shorten them along this axis.
     """
     scale = learned["scale"][first]
     longer = scale.argmax(dim=1)

@@ -64,9 +64,9 @@ def coarsen(state: State, side: int) -> None:
 def diffuse(state: State, step: Step) -> None:
     """Smooth the light a little: blend each texel with its neighbours on the cubemap face, and fade it towards grey.
 
-    Both effects are proportional to the light's learning rate. They are a step apart from the optimiser's, like decoupled weight decay
-    (Loshchilov and Hutter 2019). Where the photos agree on a texel, the optimiser moves it faster than this step, and details and colours
-    stay. Where only noise moves the texels, they become alike and grey. The mean over all texels and channels does not change.
+    Both effects are proportional to the light's learning rate. They are separate from the optimiser's step, like decoupled weight decay
+    (Loshchilov and Hutter 2019). Where the photos agree on a texel, the optimiser is stronger than this step: details and colours stay.
+    Where only noise moves the texels, they become alike and grey. The mean over all texels and channels does not change.
     """
     side = math.isqrt(len(state.learned["environment"]) // 6)
     rate, settings = state.learned.rates["environment"], state.settings.environment
@@ -83,7 +83,7 @@ def diffuse(state: State, step: Step) -> None:
 
 
 def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
-    """Average the light's radiance (3,) over the pixels in which cameras see it mirrored. All these pixels count equally.
+    """Average the light's radiance (3,) over all pixels in which the object mirrors it to a camera. These pixels count equally.
 
     Returns None if the scene has no light, or if no term of the loss uses this mean.
     """

@@ -140,7 +140,7 @@ def objective(
     The loss is the sum of these terms, each with a weight in `weights`:
 
     - Colour: (1 − λ) L1 + λ D-SSIM of sRGB pictures. The photo is composited over `background`. Where a channel of the photo is clipped
-      and the mask is at least one half, the photo is a lower bound: a brighter rendering has neither loss nor gradient. Elsewhere the
+      and the mask is at least one half, the scene may be brighter: a brighter rendering has neither loss nor gradient. Elsewhere the
       rendering is not clipped, so that pixels that are too bright have a gradient.
     - Normals: 1 − ÑᵀN where the surface is opaque around the pixel. N is the rendered normal. Ñ is the normal of the depth map, by central
       differences.

@@ -1,10 +1,10 @@
-"""Refine the cameras' poses during the training, and find out whether they need it.
+"""Refine the cameras' poses during the training, and find out whether the poses need refinement.
 
 Each view has a pose (see `render.align`), which moves the scene in front of its camera. Whenever a view is trained on, its pose takes a
 Gauss-Newton step towards the photo. The first steps use reduced pictures, so that a camera that is off by some pixels still converges.
 
 Features that photos have in common tell whether poses need refinement, and whether they have become better. The error against the photos
-cannot tell: poses also move to fit mirrored images that the scene does not explain yet, and a mirrored image is not at rest on its mirror.
+cannot tell: it also falls if poses move to fit reflections, which the scene does not explain yet, and which move over the surface.
 """
 
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ class Poses(Part):
     """Remember the poses of the views.
 
     `given` are the views' cameras in the capture. `values` (V, 6) are the poses; None means that the given cameras are used. `judged` tells
-    whether `judge` has compared both.
+    whether `judge` has already compared the given and the refined cameras.
     """
 
     name, saved = "poses", ("judged", "values")
@@ -43,7 +43,7 @@ class Poses(Part):
     def start(self, state: State) -> None:
         """Give every view a zero pose, if poses are to be refined.
 
-        They are if the setting `cameras.poses` is "on", or if it is "auto" and features contradict the given cameras.
+        Poses are refined if the setting `cameras.poses` is "on", or if it is "auto" and features contradict the given cameras.
         """
         self.given, wanted = [view.camera for view in state.views], state.settings.cameras.poses
         if wanted == "auto":
@@ -100,7 +100,7 @@ def remove_common(state: State, step: Step) -> None:
 
 
 def judge(state: State, step: Step) -> None:
-    """Once, compare the refined cameras with the given ones. Go back to the given ones unless features fit the refined ones far better.
+    """Compare the refined cameras with the given ones, once. Keep the refined ones only if features fit them far better.
 
     This is done only if the setting `cameras.poses` is "auto".
     """

@@ -3,8 +3,8 @@
 Paint explains photos of a rough or embossed metal about as well as metal does. Training starts near paint, so it would stay there. The tint
 of a surfel's change with the view tells metal from paint before normals and light are known.
 
-Where nearly all of the surface shines as coloured metals do, metallic no longer learns. Photos alone would turn some of it back into paint,
-because roughness, light and base colour explain rough metal and paint about as well.
+If nearly all of the surface shines as coloured metals do, metallic no longer learns. Photos alone would turn parts of the surface back into
+paint, which explains the photos about as well.
 """
 
 import torch
@@ -29,7 +29,7 @@ HELD = Kinds(metal=0.98, paint=0.002)  # metallic that does not learn, in the or
 
 
 class Metals(Part):
-    """Remember whether metals were `found`, by photos or by hints."""
+    """Remember in `found` whether photos or hints have told which surfels are metal."""
 
     name, saved = "metals", ("found",)
     found = False
@@ -52,12 +52,12 @@ def find_metals(state: State, step: Step) -> None:
     - Neither explains the changes of coloured surfels. Then nothing coloured is metal. Fur is an example: it hides and shows what is
       below it, which has the same colour.
 
-    If nearly all surfels shine as coloured metals do, all are metal from then on (see `hold`). They may also shine faintly, as long as
-    mirroring explains that. Otherwise, the other surfels keep their metallic. It started low, as that of a dielectric.
+    If nearly all surfels shine as coloured metals do, all are metal from then on (see `hold`). Faint shining is enough if mirroring
+    explains the changes. Otherwise, surfels that are not found keep their metallic, which started low, as that of a dielectric.
 
     If most of the coloured surface shines, dark parts may be metal as well, such as patina. Then the loss term `loss.dark` ends.
 
-    Schedules that propagate normals find metals by that, as the paper does. Nothing is set for them.
+    Schedules that propagate normals do not call this function. Propagation finds the metals there, as in the paper.
     """
     if state.part(Metals).found:
         return
@@ -97,7 +97,8 @@ def judge(state: State, step: Step) -> None:
     A surfel that is taken for paint becomes metal if it belongs to the same piece as metals do. It takes their base colour and roughness.
     An example is the lower half of a ball on a table: it mirrors evenly, so it has learned the mirrored table as its own colour.
 
-    A metal becomes paint if it looks the same from everywhere, although what it would mirror changes. Training can still change both.
+    A metal becomes paint if it looks the same from everywhere, although a metal would mirror different things. Training can still change
+    the metallic that is set here.
     """
     if not state.part(Metals).found:
         return
@@ -121,10 +122,10 @@ def judge(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
-    """Measure where photos do not tell metal from paint (see `same_material.doubt`), and announce on how much of the surface.
+    """Measure where photos do not tell metal from paint (see `same_material.doubt`). Announce the fraction of the surface.
 
     Returns the doubt of each surfel (N,) in 0..1, and facts for metrics.json. `part` is the fraction of the surface whose doubt is at least
-    DOUBTFUL. `what` is the text that is announced if that fraction is more than TOLD. Returns None where photos do not decide what is
+    DOUBTFUL. `what` is the text that is announced if that fraction is more than TOLD. Returns None if photos do not decide what is
     metal: without a light, without specular shading, or without a mask of each photo. Surfels whose metallic is held are not in doubt.
     """
     if not state.from_hull or not metals_decidable(state, state.iteration):
@@ -144,7 +145,7 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
 
 @torch.no_grad()
 def hold_as(state: State, kinds: torch.Tensor) -> None:
-    """Hold the metallic of surfels from now on (see `hold`). `kinds` (N,) has their index in `hints.KINDS`, or −1 for those that learn."""
+    """Hold the metallic of surfels from now on (see `hold`). `kinds` (N,) are indices in `hints.KINDS`, or −1 for surfels that learn."""
     for number in range(len(HELD)):
         state.learned["metallic"][kinds == number] = raw_metallic(HELD[number])
     state.learned["held"].copy_(kinds >= 0)
@@ -153,7 +154,7 @@ def hold_as(state: State, kinds: torch.Tensor) -> None:
 
 
 def hold(state: State) -> None:
-    """Remove the gradient of the metallic of surfels where `held` (N,) is true, so that it stays."""
+    """Remove the gradient of the metallic where `held` (N,) is true, so that the metallic of these surfels does not change."""
     metallic = state.learned.get("metallic")
     if metallic is not None and metallic.grad is not None:
         metallic.grad.masked_fill_(state.learned["held"], 0)

@@ -29,7 +29,7 @@ GRAZING = 0.15  # least cosine between normal and camera; at more grazing angles
 
 
 class Kinds(NamedTuple):
-    """Hold a number for each of the two kinds of surfaces."""
+    """Hold one number for metal surfaces and one for painted surfaces."""
 
     metal: float
     paint: float
@@ -55,7 +55,7 @@ class Observations(NamedTuple):
 
     @property
     def usable(self) -> Tensor:
-        """Tell which photos count for which surfels (N, V). None counts for a surfel that too few photos show."""
+        """Tell which photos show which surfels well enough (N, V). A surfel that too few photos show has no usable photo."""
         shown = self.pixels > LEAST_PIXELS
         return shown & (shown.sum(dim=1, keepdim=True) >= LEAST_VIEWS)
 
@@ -65,8 +65,8 @@ class Seen(NamedTuple):
 
     - `radiance` (N, V, 3): linear, without the photo's exposure
     - `weight` (N, V): the surfel's blending weights, summed over its pixels; 0 where the surfel is clipped, hardly seen or grazing
-    - `pixels` (N,): the blending weights in all photos, wherever it is seen
-    - `mean` (N, 3): the mean radiance, of all pixels
+    - `pixels` (N,): the surfel's blending weights, summed over its pixels in all photos, also where `weight` is 0
+    - `mean` (N, 3): the mean radiance over the same pixels
     - `normal` (N, V, 3): the unit normal that is blended at its pixels
     - `towards` (N, V, 3): the unit direction to the camera
     """
@@ -88,11 +88,11 @@ class Seen(NamedTuple):
 def observe_changes(state: State) -> Observations:
     """Compare some training photos with a model in which each surfel looks the same from everywhere.
 
-    The model's radiance is fitted to the photos, with an exposure for each photo. The model includes occlusion, and pixels that surfels
-    share.
+    The model's radiance is fitted to the photos, with an exposure for each photo. The model knows that surfels hide each other, and that
+    several surfels share a pixel.
 
-    If the light turns with the camera, the diffuse light on a matte surface changes from photo to photo, too. The model then also has
-    spherical harmonics of degree 2 of the normal in the camera's frame, as irradiance has (Ramamoorthi and Hanrahan 2001).
+    If the light turns with the camera, the diffuse light on a matte surface changes from photo to photo, too. The model then also has its
+    irradiance: spherical harmonics of degree 2 of the normal in the camera's frame (Ramamoorthi and Hanrahan 2001).
     """
     surfels = Surfels(*(value.detach() for value in state.surfels()))
     photos = [state.photo(view) for view in probe.spread_views(state, OBSERVED_VIEWS)]
@@ -120,7 +120,7 @@ def observe_changes(state: State) -> Observations:
 
 @torch.no_grad()
 def observe_mirrored(state: State, inputs: RenderInputs, views: list[int]) -> Seen:
-    """Observe the surfels of `inputs` in some training views, without the photos' exposures, and the normals blended there."""
+    """Measure the radiance of the surfels of `inputs` in some training views, without exposures, and the normals blended there."""
     sums = [_sums(state, inputs, view) for view in views]
     radiance, pixels, clipped, normal = torch.stack(sums, dim=1).cpu().split([3, 1, 1, 3], dim=2)
     towards = _towards(inputs.surfels, [state.photo(view) for view in views]).cpu()
@@ -181,9 +181,9 @@ def _residuals(
 
 
 def _fitted(factor: Tensor, totals: Tensor, pixels: Tensor, mean: Tensor, light: Tensor | None) -> Tensor:
-    """Fit the factor of each surfel in each photo (N, V) to the residuals.
+    """Fit the factors (N, V) on each surfel's mean radiance in each photo to the residuals: the exposure and the diffuse light.
 
-    `light` (N, V, 9) are harmonics of the diffuse light. Without it, a factor depends on the photo alone. A photo's factor is a median,
+    `light` (N, V, 9) are harmonics of the diffuse light. Without it, a factor depends on the photo alone. A photo's exposure is a median,
     because highlights hardly move a median.
     """
     brightness = mean.mean(dim=1)
@@ -200,14 +200,14 @@ def _fitted(factor: Tensor, totals: Tensor, pixels: Tensor, mean: Tensor, light:
 
 
 def from_grey(colour: Tensor) -> Tensor:
-    """Return the differences (N, 3) of the chromaticities of linear colours (N, 3) from that of grey."""
+    """Return how far the chromaticities of linear colours (N, 3) are from grey: each channel's share of the sum, less 1/3."""
     return colour / colour.sum(dim=1, keepdim=True).clamp_min(1e-6) - 1 / 3
 
 
 def averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Average observations over each surfel's neighbours, as listed in `near` (N, K).
 
-    Returns the mean radiance (N, 3), the changes (N, V, 3), and which photos show them unclipped (N, V).
+    Returns the mean radiance (N, 3), the changes from it in each photo (N, V, 3), and where these are known (N, V).
     """
     weight = observations.pixels * (observations.clipped < LEAST_CLIPPED) * (observations.pixels > LEAST_PIXELS)
     pixels = pooled(weight, near)
