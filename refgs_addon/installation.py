@@ -242,7 +242,10 @@ def _choose_lock(program: Path, variables: dict[str, str], home: Path, locks: Pa
 
 
 def _resolve(program: Path, variables: dict[str, str], home: Path, requirements: Path) -> dict[str, tuple[str, str]]:
-    """Ask uv which version of each package in a file it takes for this machine, and from which index. Returns both by the package."""
+    """Ask uv which version of each package it takes for this machine, and from which package index.
+
+    `requirements` is a file that names the packages. Returns (version, index) by package.
+    """
     how = ["--no-deps", "--no-header", "--no-annotate", "--emit-index-annotation", "--python", str(python(home))]
     said = _run_uv(program, variables, home, "pip", "compile", *how, str(requirements))
     return {name: (version, index) for name, version, index in re.findall(r"(?m)^(\S+)==(\S+)\n +# from (.+)$", said)}

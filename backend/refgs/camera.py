@@ -50,8 +50,8 @@ class Camera:
     def heading(self) -> float:
         """Return the compass direction that the camera looks in: an angle about the world's z axis, in radians.
 
-        It is 0 for a level camera that looks along +y, and grows counter-clockwise seen from above. Tilting or rolling a level camera
-        does not change it. It is also defined for a camera that looks straight down: the camera's right axis is used too.
+        It is 0 for a level camera that looks along +y, and grows counter-clockwise seen from above. Tilting or rolling a level camera does
+        not change it. It depends on the camera's forward and right axes, so it is also defined for a camera that looks straight down.
         """
         right, _, forward = self.camera_to_world[:3, :3].T
         return float(np.arctan2(right[1] - forward[0], right[0] + forward[1]))

@@ -59,9 +59,9 @@ def train(asked: Asked, report: Report, attend: "Callable[[State], bool]") -> "t
     """Train on a capture and write a run folder, or resume the training in it. At the end write the results and measure their quality.
 
     - `report(event, facts)` is called for progress and warnings.
-    - `attend(state)` is called before each iteration. If it returns True, the training stops with a checkpoint, and can be resumed.
-      Another process can stop it too (`refgs.lock`).
-    - With hints, most of a finished run's training is repeated while the hinted parts are held (`train/hints.py`).
+    - `attend(state)` is called before each iteration. If it returns True, the training stops with a checkpoint, and can be resumed. Another
+      process can stop it too (`refgs.lock`).
+    - With hints, most of a finished run's training is repeated. The hinted parts of the surface stay metal or paint (`train/hints.py`).
 
     Returns the training's state and the mean PSNR of the held-out views. `state.ended` is False if the training was stopped. The PSNR is
     None then, or if there are no held-out views.
@@ -90,10 +90,10 @@ def train(asked: Asked, report: Report, attend: "Callable[[State], bool]") -> "t
 
 
 def unfinished(asked: Asked) -> bool | None:
-    """Say what is left of a training that may have been started before: for `refgs train --once`.
+    """Tell whether `refgs train --once` must start a training, resume it, or do nothing.
 
-    Returns False if it must be started, True if it must be resumed, None if it has ended. Raises InputError if its run folder holds a
-    training with other settings than those asked for, and TryAgain if another process works in it.
+    Returns False to start it, True to resume it, None if it has ended. Raises InputError if its run folder holds a training with other
+    settings than those asked for, and TryAgain if another process works in it.
     """
     out = asked.out
     if not (out / "run.toml").exists():
@@ -181,8 +181,8 @@ def _with_masks(
     """Make masks of a capture that has none, so that the object is trained alone.
 
     Return the capture's files with their masks, and the settings. A box in the settings is moved with the capture's frame. If no object is
-    found, report a warning and return what was given. Raises InputError if masks cannot be written: learnt with its surroundings, the
-    object would be worth little.
+    found, report a warning, and return files and settings unchanged. Raises InputError if the masks cannot be written: without them, the
+    object would be trained together with its surroundings, and look bad.
     """
     from refgs.capture.masks import ReadOnlyError, masks_folder, moved_region, with_masks
 
@@ -239,7 +239,7 @@ def _trainer(
 
 
 def _save_with_hints(trainer: "Trainer", known: _Known) -> None:
-    """Save a first checkpoint and the hints. A run with hints always has a checkpoint, for it cannot start over without them."""
+    """Save a first checkpoint, then the hints. A run with hints must have a checkpoint to resume from: it cannot start over."""
     from refgs.formats.hints import FILE, write_hints
 
     out = trainer.state.folder
@@ -251,7 +251,7 @@ def _save_with_hints(trainer: "Trainer", known: _Known) -> None:
 
 @contextmanager
 def _removed_if_empty(out: Path) -> Iterator[None]:
-    """Remove a folder after a `with` block that has made it if nothing is in it."""
+    """Remove the folder `out` after a `with` block if it did not exist before the block and is empty."""
     new = not out.exists()
     try:
         yield
@@ -304,7 +304,8 @@ def _resumed(trainer: "Trainer") -> "Trainer":
 def _finish(trainer: "Trainer") -> float | None:
     """Write the results and metrics.json. Return the mean PSNR of the held-out views, None without such views.
 
-    All comes before splats.ply, by which a run has ended. So a training that is killed here is resumed, and does it again.
+    splats.ply is written last, because a run that has it counts as finished. So a training that is killed here can be resumed, and this
+    function runs again.
     """
     from refgs.run import record_changes
     from refgs.train.keep.ambiguity import ambiguities

@@ -45,8 +45,8 @@ def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material
 def connect_edits(material: bpy.types.Material) -> None:
     """Change a material of `splat_material` so that it shows edits of the splats.
 
-    It then reads metallic and roughness from each splat, even if all splats had the same value. With a specular of 0, the
-    roughness of a non-metal would have no effect. So splats with edited roughness then get a specular above 0.
+    Afterwards, the material reads metallic and roughness from each splat, even if it had one value for all splats before. With a specular
+    of 0, the roughness of a non-metal would have no effect. So splats with edited roughness also get a specular above 0.
     """
     tree = material.node_tree
     shader = principled(material)

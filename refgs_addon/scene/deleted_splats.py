@@ -1,4 +1,4 @@
-"""Delete single splats of a run, such as floaters in the air, until the artist wants them back."""
+"""Delete single splats of a run, such as floaters in the air, and bring them back."""
 
 import bpy
 
@@ -32,7 +32,7 @@ def add_points(splats: bpy.types.Object) -> bpy.types.Object:
 
 
 def points_of(splats: bpy.types.Object) -> bpy.types.Object | None:
-    """Find the mesh of the splats that are kept. Returns None if none was ever deleted, or the mesh itself was."""
+    """Find the mesh that `add_points` has made. Returns None if it was never made, or if the artist has deleted it."""
     modifier = splats.modifiers.get(NAME)
     return compat.get_modifier_input(modifier, "Points") if modifier else None
 

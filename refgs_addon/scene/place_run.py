@@ -13,7 +13,7 @@ Box = tuple[Vector, Vector]  # lowest and highest corner, in world space
 
 
 def extent(splats: bpy.types.Object, meshes: list[bpy.types.Object]) -> Box:
-    """Return the box around a run that stands where it was imported: around its mesh, or around most of its splats without one."""
+    """Return the box around a run that was not moved after its import: around its mesh, or around most of its splats if it has no mesh."""
     solid = [item for item in meshes if item.data.polygons]
     return _box(solid) if solid else bounds(splats.data)
 
@@ -21,7 +21,8 @@ def extent(splats: bpy.types.Object, meshes: list[bpy.types.Object]) -> Box:
 def put_beside(collection: bpy.types.Collection, layer: bpy.types.ViewLayer) -> bpy.types.Object | None:
     """Move a run that was just imported out of other visible objects, such as Blender's default cube, along x.
 
-    Returns the object that it stands beside now, or None if it was not moved. It is not moved out of an object LARGE times its size.
+    Returns the object that the run stands beside now, or None if it was not moved. An object with at least LARGE times the run's longest
+    side counts as a room: the run may stand in it.
     """
     layer.update()
     low, high = extent(parts(collection)["splats"][0], parts(collection).get("mesh", []))

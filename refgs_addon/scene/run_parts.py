@@ -32,7 +32,7 @@ def cameras(collection: bpy.types.Collection) -> bpy.types.Collection | None:
 def show(collection: bpy.types.Collection, part: str) -> None:
     """Show one part of a run, "splats" or "mesh", in the viewport and in renders, and hide the other part.
 
-    If the splats are shown, only the camera does not see the mesh: it still casts their shadows, and reflections show it.
+    If the splats are shown, the mesh is invisible to the camera, but it casts the run's shadows and appears in reflections.
     """
     found = parts(collection)
     for item in found.get("splats", []):

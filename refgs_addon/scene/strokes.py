@@ -38,7 +38,7 @@ def camera_with_photo(context: bpy.types.Context) -> bpy.types.Object | None:
 
 
 def canvases() -> list[bpy.types.Image]:
-    """List the canvases in this file."""
+    """List the canvases in the open .blend file."""
     return [image for image in bpy.data.images if STROKES in image]
 
 
@@ -90,7 +90,10 @@ def save(capture: Path) -> list[Path]:
 
 
 def masks_root(capture: Path) -> Path:
-    """Return the folder that holds a capture's folders masks and strokes. It is the capture's, or that above a folder of reduced photos."""
+    """Return the folder that holds a capture's folders masks and strokes.
+
+    This is `capture` itself, or the folder above it if `capture` is a folder of reduced photos, such as images_4.
+    """
     reduced = re.fullmatch(r"images_\d+", capture.name) and (capture.parent / "sparse").is_dir()
     return capture.parent if reduced else capture
 
@@ -160,7 +163,10 @@ def _pixels(image: bpy.types.Image) -> "np.ndarray":
 
 
 def _read(path: Path, width: int, height: int, turns: int = 0) -> "np.ndarray":
-    """Read a picture file, reduced to a size and then turned: RGBA, top row first. Raises InputError if Blender cannot open it."""
+    """Read a picture file as RGBA, top row first. Raises InputError if Blender cannot open it.
+
+    The picture is turned counter-clockwise by `turns` quarter turns. The result has `width` × `height` pixels.
+    """
     import numpy as np
 
     try:

@@ -83,7 +83,7 @@ def match_light(scene: bpy.types.Scene) -> None:
 def correct_diffuse(scene: bpy.types.Scene) -> None:
     """Correct the diffuse light of imported runs in Eevee after the scene's world has changed.
 
-    A world that RefGS did not make is shown as Eevee shows it.
+    If RefGS did not make the world, nothing is corrected.
     """
     tree = bpy.data.node_groups.get(NAME)
     if tree is None:

@@ -1,4 +1,4 @@
-"""Draw what a training decided about a scene as a choice, with pictures of both answers, in the Train panel."""
+"""Draw each decision of a training as a choice in the Train panel, with pictures of both answers."""
 
 from pathlib import Path
 
@@ -50,7 +50,7 @@ class TrainOtherWay(_OnDecision, bpy.types.Operator):
 
 
 def draw_decisions(box: bpy.types.UILayout, scene: bpy.types.Scene, folder: Path, width: int) -> None:
-    """Draw the decisions of a run that the artist has not confirmed. `width` is how many letters fit into a line."""
+    """Draw those decisions of a run that the artist has not confirmed yet. `width` is how many letters fit into a line."""
     for decision in open_decisions(scene, folder):
         _draw(box.box(), folder, decision, width)
 

@@ -176,7 +176,7 @@ def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, folder: 
 
 
 def _draw_library(box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
-    """Draw the job that makes runs assets."""
+    """Draw the job that turns runs into assets for the asset browser."""
     row = box.row()
     row.label(text=job.name, icon={"done": "CHECKMARK", "failed": "ERROR"}.get(job.state, "SORTTIME"))
     row.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).serial = job.serial

@@ -116,7 +116,7 @@ class ChooseBrush(ReportsErrors, bpy.types.Operator):
 
 
 def choose_brush(settings: bpy.types.ToolSettings, paints: str) -> None:
-    """Make the brush for images paint the object (white), the rest (black), or take away ("nothing")."""
+    """Set up the brush for images: to paint the "object" white, to paint the "rest" black, or to erase strokes ("nothing")."""
     colors = compat.paint_colors(settings)
     colors.use_unified_color = True
     colors.color, colors.secondary_color = ((0.0,) * 3, (1.0,) * 3) if paints == "rest" else ((1.0,) * 3, (0.0,) * 3)

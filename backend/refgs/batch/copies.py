@@ -29,7 +29,10 @@ Listing = dict[str, tuple[int, int]]
 
 
 def list_files(root: Path) -> Listing:
-    """List the files in a folder and in those that it links to. A file is listed under the name ".". A missing path has no files."""
+    """List the files in the folder `root` and in the folders that it links to. Return {} if it does not exist.
+
+    If `root` is a file, the listing has only this file, under the name ".".
+    """
     if root.is_file():
         return {".": _facts(root)}
     found = {}
@@ -57,7 +60,10 @@ class Depot:
         self._mark, self._tickets = mark, Counter()
 
     def begin(self, roots: tuple[Path, ...]) -> tuple[Path, dict[Path, int]]:
-        """Return the mark, and tickets for writing in folders. Earlier tickets, of steps that Ray has given up, are no longer valid."""
+        """Register a step that writes to `roots`. Return the file `mark` of `__init__`, and a ticket for each of `roots`.
+
+        A step needs the ticket to write there. An earlier ticket is no longer valid: Ray has given up the step that has it.
+        """
         self._tickets.update(roots)
         return self._mark, {root: self._tickets[root] for root in roots}
 
@@ -66,7 +72,7 @@ class Depot:
         return list_files(root)
 
     def read(self, file: Path, start: int) -> bytes:
-        """Return the next PART bytes of a file; fewer at its end."""
+        """Return PART bytes of a file, beginning at the byte `start`. Return fewer at the end of the file."""
         with open(file, "rb") as opened:
             opened.seek(start)
             return opened.read(PART)
@@ -92,10 +98,11 @@ class Depot:
 def at_hand(reads: tuple[Path, ...], writes: tuple[Path, ...], depot: Any) -> Iterator[None]:
     """Copy files and folders of the batch's machine to this one for a `with` block, and copy back what the block writes.
 
-    Nothing is copied if the folder of the batch is shared, or without a `depot`. Otherwise, files are copied before the block, and changes
-    in `writes` are copied back during the block and after it. The copies stay for the next step: see `remove_copies`.
+    Nothing is copied if `depot` is None, or if this machine shares the batch's folder. Otherwise, files are copied before the block, and
+    changes in `writes` are copied back during the block and after it. The copies stay for the next step: see `remove_copies`.
 
-    Raises InputError if a folder exists here that is no copy and has other files. Raises TryAgain if the batch's machine does not answer.
+    Raises InputError if one of the paths exists here with other files than the original, and is not a copy of an earlier step. Raises
+    TryAgain if the batch's machine does not answer.
     """
     if depot is None:
         yield
@@ -115,7 +122,10 @@ def at_hand(reads: tuple[Path, ...], writes: tuple[Path, ...], depot: Any) -> It
 
 
 def remove_copies(roots: list[Path], mark: Path) -> None:
-    """Remove the copies that this machine has of files and folders of a batch. `mark` is that of the batch's machine."""
+    """Remove the copies of a batch's files and folders `roots` from this machine.
+
+    Nothing is removed if this machine shares the batch's folder: it then sees the file `mark` of the batch's machine.
+    """
     if mark.exists():
         return
     for root in roots:
@@ -138,7 +148,7 @@ def _mark(root: Path) -> Path:
 
 
 def _fetch(root: Path, depot: Any) -> Listing:
-    """Update the copy of a file or folder from its original. Returns the listing of both."""
+    """Update the copy of a file or folder from its original. Returns the listing of the original, which the copy then has, too."""
     there, here = _get(depot.listing.remote(root)), list_files(root)
     if not _mark(root).exists():
         if here and here == there:  # this folder is shared
@@ -174,10 +184,13 @@ def _write(file: Path, parts: Iterator[bytes], time: int) -> None:
 
 
 class _Back:
-    """Copy back what changes in folders, in a thread, until `end` is called. A thread is used because Ray interrupts stopped steps."""
+    """Copy back what changes in folders, in a thread, until `end` is called.
+
+    Ray stops a step by interrupting the main thread. The copying thread goes on, so the last changes are copied, too.
+    """
 
     def __init__(self, folders: dict[Path, tuple[int, Listing]], depot: Any):
-        """Start to copy. `folders` has the ticket of each folder, and the listing that the batch's machine has of it."""
+        """Start the thread. `folders` maps each folder to its ticket (see `Depot.begin`) and the listing of its original."""
         self._folders, self._depot, self._error = folders, depot, None
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -225,7 +238,10 @@ class _Back:
 
 
 def _get(reference: Any) -> Any:
-    """Wait for a value. Raises the error with which it failed, and TryAgain if the machine that has it does not answer."""
+    """Wait for the value of a Ray reference, and return it.
+
+    Raises the error that the remote call raised, or TryAgain if the batch's machine does not answer.
+    """
     import ray
     import ray.exceptions
 

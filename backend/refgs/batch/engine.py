@@ -44,12 +44,12 @@ ENVIRONMENT = {
 
 
 class Engine:
-    """Run steps by Ray. A step starts when those before it have ended and a machine has what it needs."""
+    """Run steps by Ray. A step starts when the steps that it waits for have ended, and a machine has cores, memory and cards free."""
 
     def __init__(self, ray: Any, cores: int):
-        """Look at the machines of a Ray that has been started. `cores` is the number of cores of each step.
+        """Read the cores, memory and CUDA cards of the machines of a running Ray. `cores` is the number of cores of each step.
 
-        Raises InputError if no machine has cores.
+        Raises InputError if no machine lends cores to Ray.
         """
         self._ray, self._depot = ray, None
         self._steps: dict[Any, Step] = {}
@@ -65,15 +65,15 @@ class Engine:
         self.cards = int(max(node.get("GPU", 0) for node in nodes))
 
     def card_bytes(self) -> int:
-        """Return the memory of a card of the cluster, in bytes."""
+        """Return the memory in bytes of one of the cluster's CUDA cards. Ray chooses which."""
         return self._ray.get(self._ray.remote(_card_bytes).options(num_gpus=0.01).remote())
 
     def submit(self, step: Step, memory: int, card: float, before: list[tuple[Any, bool]]) -> Any:
         """Hand a step to Ray. Returns a reference to its outcome.
 
-        `memory` is the memory that it needs, in bytes, and `card` its share of a CUDA card, 0 … 1. `before` lists the steps for which it
-        waits: their references or outcomes, and whether they are optional. No step asks for more than nine tenths of the memory that a
-        machine has.
+        `memory` is the memory that the step needs, in bytes. It is limited to nine tenths of the memory of the largest machine. `card` is
+        the step's share of a CUDA card, 0 … 1. `before` has a pair for each step that this step waits for: its reference or outcome, and
+        whether it is optional.
         """
         how = {
             "num_cpus": self._cores,
@@ -90,7 +90,10 @@ class Engine:
         return reference
 
     def ended(self, seconds: float) -> Iterator[tuple[Step, Outcome]]:
-        """Wait for steps to end, for some seconds at most. Yields those that did. Raises TryAgain if Ray's head has died."""
+        """Wait for a step to end, at most for `seconds`. Yields every step that has ended, and its outcome.
+
+        Raises TryAgain if Ray's head has died.
+        """
         if not self._steps:
             return
         self._check_head()
@@ -131,15 +134,16 @@ class Engine:
             return Outcome(TRY_AGAIN, what=f"its worker died {TRIES + 1} times ({why}): see that memory suffices")
 
     def cancel(self) -> None:
-        """End all steps: those that run write a checkpoint first."""
+        """Stop all steps. A running step writes a checkpoint before it ends."""
         for reference in self._steps:
             self._ray.cancel(reference, recursive=False)  # and not what copies their files back
 
     @contextmanager
     def lending(self, folder: Path) -> Iterator[None]:
-        """Let machines that do not share the `folder` of the batch's logs copy the files of all steps, for a `with` block.
+        """Let other machines copy the files of all steps during a `with` block. `folder` is the folder of the batch's logs.
 
-        After the block, the copies are removed; if it raises an error, they stay for the next batch.
+        A machine that shares `folder` needs no copies. The copies are removed after the block. If the block raises an error, they stay for
+        the next batch.
         """
         for old in folder.glob(f"{MARK}*"):
             old.unlink()
@@ -203,9 +207,10 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
 
 
 def _keep_ignoring(ray: Any) -> None:
-    """Ignore SIGTERM again half way through Ray's shutdown.
+    """Ignore SIGTERM until the end of Ray's shutdown.
 
-    When Ray closes its log, it restores the system's handler of SIGTERM, which ends the process.
+    When Ray closes its log, it restores the system's handler of SIGTERM, which ends the process. So SIGTERM is ignored once more after
+    that.
     """
     node = ray._private.worker._global_node
     if node is None or threading.current_thread() is not threading.main_thread():
@@ -221,10 +226,10 @@ def _keep_ignoring(ray: Any) -> None:
 
 @contextmanager
 def _signals(handler: Any) -> Iterator[None]:
-    """Let `handler` handle SIGINT and SIGTERM in a `with` block, and restore the earlier handlers after it.
+    """Let `handler` handle SIGINT and SIGTERM in a `with` block. After the block, restore the handlers from before it.
 
-    The earlier ones must be restored because Ray sets its own for SIGTERM when it starts. If `handler` is None, only restore them. Does
-    nothing outside of the main thread.
+    Use None for `handler` if the code in the block sets handlers itself, as Ray does for SIGTERM when it starts. Does nothing outside of
+    the main thread.
     """
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
     before = {number: signal.getsignal(number) for number in numbers}

@@ -59,7 +59,7 @@ class Job(NamedTuple):
     ask: Ask
 
     def settings(self) -> Settings:
-        """Load the settings of the training. If they will be chosen for a time, return those of the preset `standard` instead."""
+        """Load the settings of the training. If they will be chosen later to fit a time limit, load the preset `standard`."""
         return load_settings(self.ask.preset or "standard", self.ask.set)
 
 
@@ -115,14 +115,17 @@ def _jobs_of_list(file: Path, ask: Ask, above: tuple[Path, ...]) -> Iterator[Job
 
 
 def _beside(file: Path, name: str) -> Path:
-    """Return the path of a file or folder that a list names. It is relative to the list's folder."""
+    """Return the absolute path of the file or folder `name` in a list. The name is relative to the folder of the list `file`."""
     if "\0" in name:
         raise InputError(f"{file}: {name!r} is no path: correct the list")
     return Path(os.path.realpath(file.parent / name))  # and not Path.resolve, which raises for names that are too long
 
 
 def _check_unique(source: Path, out: Path, jobs: list[Job]) -> None:
-    """Check the names of runs. Check that no capture is listed twice, and no run belongs to two trainings."""
+    """Check that each run's name can be a folder's, that no capture is listed twice, and that no two trainings have one run folder.
+
+    Raises InputError.
+    """
     names: dict[Path, str] = {}
     runs: dict[str, Job] = {}
     for job in jobs:

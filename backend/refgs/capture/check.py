@@ -53,8 +53,8 @@ def check(capture: Capture, out: Path) -> dict[str, Any]:
 def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
     """Describe a capture in lines of text. At the end there is a line `Warning: …` for each likely mistake.
 
-    Decodes every photo, mask and prior. If the folder `thumbnails` is given, thumbnails of up to 12 photos are written to it. Raises
-    InputError if any of these cannot be read: the message gives their number and the name of the first.
+    Decodes every photo, mask and prior. Raises InputError if some of these files cannot be read: the message says how many, and names the
+    first. If the folder `thumbnails` is given, thumbnails of up to 12 photos are written to it.
     """
     statistics = _decode_all(capture, thumbnails)
     return [
@@ -76,8 +76,8 @@ class _Statistics:
     """Hold statistics of one photo. If it has a mask, only pixels inside the mask are measured.
 
     `coverage` is the fraction of pixels inside the mask, None without a mask. `clipped` is the fraction of clipped pixels. `brightness` is
-    the mean 8-bit value, and `brightest` the value that 99 % do not exceed. `grey` is True if the photo has no colour. `sharpness` comes
-    from `_sharpness`.
+    the mean of the 8-bit values, and `brightest` their 99th percentile. `grey` is True if the photo has no colour. `sharpness` comes from
+    `_sharpness`.
     """
 
     def __init__(self, loaded: LoadedView):
@@ -174,7 +174,10 @@ def _priors(capture: Capture) -> list[str]:
 
 
 def _guessed_object(capture: Capture) -> list[str]:
-    """Report where a training without masks looks for the object. Return no line if there are masks, or if the training makes none."""
+    """Report the box in which a training without masks looks for the object, as a list of one line.
+
+    Return [] if a photo has a mask, if the user has set a box, or if a training cannot make masks of this capture.
+    """
     if any(view.masked for view in capture.views) or capture.layout in Z_UP or capture.box is not None:
         return []
     from refgs.capture.masks import (  # imports scipy, which a wrong folder should not wait for

@@ -29,7 +29,10 @@ def write_hashes(run: Path, hashes: dict[str, str]) -> None:
 
 
 def changed_files(run: Path, hashes: dict[str, str]) -> list[str]:
-    """Return the files whose hashes are not those in a run's folder, by their paths. Runs of earlier releases have no hashes."""
+    """Return the paths of the files whose hashes differ from those in a run's folder.
+
+    Return [] if the folder has no hashes, as in runs of earlier releases.
+    """
     try:
         known = _HASHES.validate_json(read_bytes(run / FILE))
     except (OSError, ValidationError):

@@ -7,10 +7,11 @@ If the camera moves around an object that stands still, the surroundings help to
 first, with or without masks.
 
 If the object stands on a turntable instead, the surroundings do not turn with it and lead to wrong cameras. Therefore matches at the same
-pixel in both photos are dropped. This does not help if the camera also moved a little: some cameras then follow the turntable and others
-the surroundings (all 66 photos of a bronze head got cameras, 19° wrong on average), or get none. Such cameras leave many feature matches
-unexplained. If there are masks, the cameras are then found anew from the pixels inside them, and kept if they explain more. A shiny object
-has few strong features, so weaker ones count there. Without masks, the user gets a warning.
+pixel in both photos are dropped. This does not help if the camera also moved a little: some photos then get cameras that follow the
+turntable, others follow the surroundings, and some get no camera. (All 66 photos of a bronze head got cameras, 19° wrong on average.) Such
+cameras leave many feature matches unexplained. If there are masks, the cameras are then found anew from the pixels inside them, and kept if
+they explain more. A shiny object has few strong features. Therefore weaker features count, too, inside the masks. Without masks, the user
+gets a warning.
 """
 
 import hashlib
@@ -55,8 +56,8 @@ WITH_MASKS = (
 class _Found(NamedTuple):
     """Hold the names of the photos that got a camera, the mean reprojection error in pixels, and reasons to doubt the cameras.
 
-    `unexplained` is the fraction of feature matches that the cameras do not explain. `apart` are the names of photos that fit together but
-    share nothing with those placed. `inside` says that only the pixels inside the masks were used.
+    `unexplained` is the fraction of feature matches that the cameras do not explain. `apart` are the names of the photos in the largest
+    other group: these photos fit together, but not to the placed ones. `inside` says that only the pixels inside the masks were used.
     """
 
     placed: set[str]
@@ -143,7 +144,10 @@ def _enough(placed: set[str], photos: list[Path]) -> bool:
 
 
 def _find_masks(folder: Path, photos: list[Path]) -> list[Path]:
-    """Return the mask file of each photo. Return an empty list unless all photos have one. Raise InputError if one has another size."""
+    """Return the mask file of each photo, in the order of the photos. Return [] if any photo has no mask.
+
+    Raises InputError if a mask does not have the size of its photo.
+    """
     known = Masks(folder)
     masks = [mask for photo in photos if (mask := known.find(photo, None, "")) is not None]
     if len(masks) < len(photos):
@@ -159,7 +163,10 @@ def _find_masks(folder: Path, photos: list[Path]) -> list[Path]:
 
 
 def _uniform(masks: list[Path]) -> bool:
-    """Return whether all masks are white everywhere. Raise InputError if all are empty. Few are read where masks show an object."""
+    """Tell whether all masks are white everywhere. Raise InputError if all masks are empty.
+
+    Reading stops at the first mask that shows both an object and its surroundings. So usually only one mask is read.
+    """
     empty = white = True
     for mask in masks:
         inside = read_mask(mask) > 127
@@ -266,8 +273,8 @@ def _run_colmap(photos: list[Path], masks: list[Path], database: Path, model: Pa
 def _search(photos: list[Path], masks: list[Path], database: Path, progress: Callable) -> tuple[Any, _Found]:
     """Find cameras from the whole photos, or from the pixels inside the masks if there are any.
 
-    Returns the largest model (a pycolmap.Reconstruction, whose images are named by the photos' indices) and what there is to say about it.
-    The model is None if no photo got a camera.
+    Returns the largest model and a _Found about it. The model is a pycolmap.Reconstruction, whose images are named by the photos' indices.
+    It is None if no photo got a camera.
     """
     import pycolmap
 
@@ -287,7 +294,10 @@ def _search(photos: list[Path], masks: list[Path], database: Path, progress: Cal
 
 
 def _describe(models: list[Any], photos: list[Path], database: Path, inside: bool) -> tuple[Any, _Found]:
-    """Return the largest model and what there is to say about it. `models` are sorted, the largest first. There may be none."""
+    """Return the largest model, which is the first of `models`, and a _Found about it.
+
+    If `models` is empty, return None and a _Found without photos.
+    """
     if not models:
         return None, _Found(set(), 0.0, 0.0, set(), inside)
     best = models[0]

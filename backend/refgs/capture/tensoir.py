@@ -39,7 +39,7 @@ def is_tensoir(folder: Path) -> bool:
 
 
 def read_tensoir(folder: Path) -> tuple[list[View], list[str]]:
-    """Read the training and test views of a TensoIR capture, in the capture's coordinates, and warnings. Raises InputError."""
+    """Read a TensoIR capture. Return its training and test views, in the capture's coordinates, and warnings. Raises InputError."""
     found = _folders(folder, "train") + _folders(folder, "test")
     photos = all_found(folder, [(f"{view.name}/{PHOTOS[0]}", _photo(view)) for view, _ in found])
     warnings = []

@@ -82,7 +82,10 @@ _NOT_PERSPECTIVE = {"OPENCV_FISHEYE", "FISHEYE", "FISHEYE624", "EQUIRECTANGULAR"
 
 
 def _focal(focal: float | None, angle: float | None, size: float) -> float | None:
-    """Return a focal length in pixels, of itself or of the angle of view in radians over `size` pixels; None if neither is given."""
+    """Return `focal`, a focal length in pixels. If it is None, compute it from the angle of view over `size` pixels, in radians.
+
+    Return None if neither is given, and NaN if the angle is not between 0 and π.
+    """
     if focal is not None or angle is None:
         return focal
     return size / 2 / math.tan(angle / 2) if 0 < angle < math.pi else math.nan

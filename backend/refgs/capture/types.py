@@ -64,9 +64,10 @@ class CaptureFiles(NamedTuple):
 class Capture:
     """Photos with cameras, in the run's frame: the world coordinates used in training, with Z up.
 
-    - `to_capture` is the 4×4 float64 similarity p_capture = to_capture @ p_run. It is the identity for most captures with a layout of
-      Z_UP. Others are moved and scaled so that their region of interest has radius 1 about the origin. An up direction from the user
-      rotates the run's frame.
+    - `to_capture` is the 4×4 float64 similarity p_capture = to_capture @ p_run. If the capture's layout is in Z_UP, it is the identity,
+      unless the region of interest is too far away, too large or too small for float32. Other captures are rotated, moved and scaled: Z is
+      then up, and the region of interest, found without a box, has radius 1 about the origin. If the user gives an up direction, the run's
+      frame is rotated to it.
     - `points` (M, 3) are from structure from motion, `point_colors` (M, 3) their sRGB colours in 0..1. Both are None if the capture has
       none.
     - `centre` (3,) and `radius` are the region of interest: a ball about the object, or about a room's foreground.
@@ -120,9 +121,10 @@ class Capture:
         return hashlib.sha256(json.dumps([self.digest, self.hashes], sort_keys=True).encode()).hexdigest()
 
     def check_unchanged(self, run: Path, known: str) -> None:
-        """Raise InputError if this is not the capture that a run was trained on, as it was then. Name a file that has changed.
+        """Raise InputError if this is not the capture that `run` was trained on, or if it has changed since. Name a file that has changed.
 
-        `known` is the fingerprint in run.toml. Earlier releases wrote `digest`, which of the files' contents knows only the sizes.
+        `known` is the fingerprint in run.toml. Earlier releases wrote `digest` instead. It does not depend on the contents of files, only
+        on their sizes.
         """
         if known in (self.digest, self.fingerprint()):
             return

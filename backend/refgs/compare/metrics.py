@@ -49,8 +49,8 @@ def psnr(image: np.ndarray, reference: np.ndarray) -> float:
 def fitted_exposure(radiance: np.ndarray, alpha: np.ndarray, photo: np.ndarray) -> np.ndarray:
     """Compute a photo's exposure (3,): the factors that bring linear `radiance` (h, w, 3) closest to the sRGB-encoded `photo`.
 
-    Each channel has one, by least squares in linear colours. Pixels are used if `alpha` (h, w) is above 0.5 and the photo is not clipped
-    there. The factor of a channel that has nothing to compare is 1.
+    The factor of each channel is fitted by least squares in linear colours. Pixels are used if `alpha` (h, w) is above 0.5 and the photo is
+    not clipped there. If a channel's radiance is 0 in all used pixels, its factor is 1.
     """
     seen = (alpha > 0.5) & (photo.max(axis=-1) < 0.98)
     rendered, taken = radiance[seen].astype(np.float64), srgb_decode(photo[seen].astype(np.float64))
@@ -85,8 +85,8 @@ def flip(image: np.ndarray, reference: np.ndarray) -> float:
 def specks(image: np.ndarray, reference: np.ndarray) -> float:
     """Count wrong single pixels of an sRGB-encoded picture, in thousandths of all pixels.
 
-    A speck differs by more than SPECK from the median of the 5×5 pixels about it, in any channel. Pixels within one of such a pixel of the
-    reference, as on thin lines and small highlights, are not counted.
+    A speck is a pixel that differs by more than SPECK from the median of the 5×5 pixels about it, in any channel. It is not counted if the
+    reference has a speck at the same pixel or at one of its 8 neighbours, as on thin lines and small highlights.
     """
     stands_out = [(np.abs(x - median_filter(x, (5, 5, 1))) > SPECK).any(axis=-1) for x in (image, reference)]
     return 1e3 * float((stands_out[0] & np.logical_not(maximum_filter(stands_out[1], 3))).mean())

@@ -55,8 +55,8 @@ class GroundTruth:
     def maps(self, camera: Camera) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Read the true maps of the camera's view by name, float32 (h, w) or (h, w, 3), and the object's alpha (h, w).
 
-        Larger maps are reduced. If the folder has no maps, return {} and an alpha of 0. Raises InputError if a file is missing, is smaller
-        than the view, has another shape or too few channels, or another size than the alpha.
+        Larger maps are reduced. If the folder has no maps, return {} and an alpha of 0. Raises InputError if a file is missing, has too few
+        channels or another size than the alpha, or if its size does not fit the view (see `check_size`).
         """
         size = camera.height, camera.width
         if not self.passes:
@@ -120,7 +120,7 @@ class GroundTruth:
 
 
 def check_size(file: Path, pixels: np.ndarray, camera: Camera) -> None:
-    """Raise InputError if a true picture's size does not fit the camera's view: it must be as large, or larger and of the same shape."""
+    """Raise InputError unless a true picture has the size of the camera's view, or is larger with the same aspect ratio."""
     (height, width), size = pixels.shape[:2], f"{camera.width}×{camera.height}"
     fitted = camera.resized(width, height).fitted(max(camera.width, camera.height))
     if (fitted.width, fitted.height) != (camera.width, camera.height):

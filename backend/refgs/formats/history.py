@@ -22,10 +22,10 @@ _LINE = TypeAdapter(_Line)
 
 
 def read(file: Path) -> tuple[list[dict], int]:
-    """Read the lines of a history.jsonl file as dictionaries. Return them, and the number of damaged lines, which are left out.
+    """Read the lines of a history.jsonl file. Return a dictionary for each valid line, and the number of damaged lines.
 
-    Values are numbers or None; `parts` is a dictionary of such. A training that is killed can leave a truncated line. Raises OSError if the
-    file cannot be read.
+    The dictionaries have numbers or None as values. Only the value of the key `parts` is a dictionary, of numbers or None. A damaged line
+    can come from a training that was killed while it wrote. Raises OSError if the file cannot be read.
     """
     found, damaged = [], 0
     for line in read_bytes(file).split(b"\n"):

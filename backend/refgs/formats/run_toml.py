@@ -17,7 +17,7 @@ class Maker(Model):
 
 
 class Made(Model):
-    """Hold what is read first of run.toml: a newer release may have written the rest differently."""
+    """Hold the release that made a run. It is read before the rest of run.toml, whose format may differ in a newer release."""
 
     run: Maker
 
@@ -34,7 +34,7 @@ class Trained(Maker):
 
 
 class Change(Model):
-    """Hold a changed setting: the value that the user asked for."""
+    """Hold a row of the table [changed]: `asked` is the user's value of a setting that the training has changed."""
 
     asked: Any
 

@@ -23,7 +23,7 @@ class Textures:
     - normal (S, S, 3): unit vectors in MikkTSpace tangent space, y along v (OpenGL, glTF and Blender)
     - mask (S, S): true for a texel if its centre, or a neighbour's centre, lies on the mesh. A bilinear look-up on the mesh reads only
       these texels. The other texels are padding: copies of the nearest texel in the mask.
-    - doubt (S, S): how little photos tell whether a texel is metal or paint, 0..1; None where that is not known
+    - doubt (S, S): how unsure it is from the photos whether a texel is metal or paint, 0..1; None if the run has no such values
     - specular: 1, or 0 for a material without specular reflection
     """
 

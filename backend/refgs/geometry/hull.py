@@ -40,10 +40,11 @@ def visual_hull_points(
     - outward unit normals (count, 3). A point inside has the normal of the nearest point on the hull.
     - spacing (count,): the mean distance to the three nearest other points
 
-    `alphas` are the masks (H, W), one for each camera, floats in 0..1 or uint8. The hull is carved twice, on a grid of
-    `resolution`³ voxels: first in the cube of half-side `radius` about `centre`, then in the bounding box of the result. A view is left
-    out, with a warning, if its mask is empty or contradicts all other masks. `carve` may remove more: it is given the alphas of the voxels,
-    the corner of the first one, and the voxels' size, and returns how much of each is left. Raises InputError if no hull is left.
+    `alphas` are the masks (H, W), one for each camera, floats in 0..1 or uint8. The hull is carved twice, on a grid of `resolution`³
+    voxels: first in the cube of half-side `radius` about `centre`, then in the bounding box of the result. A view is left out, with a
+    warning, if its mask is empty, or if it cuts away much that lies inside all other masks. `carve` may remove more of the hull. It is
+    called with the voxels' alphas (X, Y, Z), the corner of the first voxel (3,) and the size of a voxel (3,). It returns which fraction of
+    each voxel is left, (X, Y, Z). Raises InputError if no hull is left.
     """
     masks, views = [], []
     for alpha, camera in zip(alphas, cameras, strict=True):

@@ -34,7 +34,7 @@ BISECTIONS = 3  # of the step between two planes
 
 
 class Photo(NamedTuple):
-    """Hold a photo: `image` (H, W, 3), codes in which `white` is 1, and its mask `alpha` (H, W) uint8."""
+    """Hold a photo: `image` (H, W, 3), in which the value `white` means 1, its mask `alpha` (H, W) uint8, and its camera."""
 
     image: np.ndarray
     alpha: np.ndarray
@@ -83,9 +83,11 @@ class DepthMap(NamedTuple):
     weight: np.ndarray
 
     def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Look up world points (N, 3). Returns the surface's depth in their pixels, its weight, and the points' own depth.
+        """Look up world points (N, 3) in the map.
 
-        The weight is 0 beyond the picture."""
+        Returns three arrays (N,): the surface's depth in each point's pixel, the weight of this depth, and the point's own depth. The
+        weight is 0 for points outside of the picture.
+        """
         pixels, away = project(self.camera, points)
         on = inside(self.camera, pixels, away)
         column, row = np.where(on[:, None], pixels, 0).astype(int).T
@@ -102,11 +104,12 @@ class _Reduced(NamedTuple):
 def depth_maps(photos: Sequence[Photo], shape: Shape, unsure: np.ndarray) -> list[DepthMap]:
     """Estimate the depth of an object's surface in photos. The surface is looked for in `shape`, such as the masks' visual hull.
 
-    Only pixels whose rays enter the shape in a voxel of `unsure` (X, Y, Z), bool, count. In other voxels, the surface is known already.
+    Depth is only estimated in pixels whose rays enter the shape in a voxel of `unsure` (X, Y, Z), bool. These are the voxels where the
+    caller does not know the surface.
 
-    Returns a map for each photo that has at least BEST neighbours. Depth is known where the neighbours show the photo's texture in the same
-    place, and where AGREE of their own maps agree. A mirror shows images of other things behind its surface. Such images seldom agree in a
-    curved mirror, but they do in a flat one.
+    Returns a map for each photo that has at least BEST neighbours. A depth has a weight above 0 only if the neighbours show the photo's
+    texture in the same place, and if the depth maps of at least AGREE neighbours agree with it. A mirror shows images of other things
+    behind its surface. Such images seldom agree in a curved mirror, but they do in a flat one.
     """
     centre, radius = shape.ball
     reduced = [_reduced(photo, shape) for photo in photos]
@@ -129,7 +132,10 @@ def _reduced(photo: Photo, shape: Shape) -> _Reduced:
 
 
 def _neighbours(cameras: list[Camera], centre: np.ndarray) -> list[np.ndarray]:
-    """Choose the NEIGHBOURS nearest cameras for each camera, among those that see the object from an angle within ANGLES away."""
+    """Choose at most NEIGHBOURS neighbours for each camera. Returns arrays of their indices, the nearest first.
+
+    Distances are angles seen from `centre`, in degrees. They must lie between ANGLES[0] and ANGLES[1].
+    """
     towards = np.stack([camera.position for camera in cameras]) - centre
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     angle = np.degrees(np.arccos((towards @ towards.T).clip(-1, 1)))
@@ -138,7 +144,10 @@ def _neighbours(cameras: list[Camera], centre: np.ndarray) -> list[np.ndarray]:
 
 
 def _sweep(photo: _Reduced, others: list[_Reduced], shape: Shape, unsure: np.ndarray) -> DepthMap:
-    """Find the depth in each pixel at which a photo looks most like the others. Only planes that lie in the shape there are tried."""
+    """Find the depth of each pixel: that of the plane on which the photo looks most like `others`.
+
+    Only planes inside the shape are tried: those where the pixel's ray meets a plane in a solid voxel. `unsure` is as in `depth_maps`.
+    """
     camera, (centre, radius) = photo.camera, shape.ball
     middle = float(camera.world_to_camera[2, :3] @ centre + camera.world_to_camera[2, 3])
     planes = 1 / np.linspace(1 / max(middle - radius, radius / 100), 1 / (middle + radius), PLANES)

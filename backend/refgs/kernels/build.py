@@ -125,7 +125,7 @@ def _sole_build(cache: Path) -> Iterator[None]:
 
 
 def _compile(target: Target, library: Path) -> None:
-    """Compile the kernels in a folder beside `library`, then move them there."""
+    """Compile the kernels in a temporary folder beside the file `library`, then move the result to `library`."""
     with tempfile.TemporaryDirectory(prefix="build-", dir=library.parent, ignore_cleanup_errors=True) as scratch:
         made = Path(scratch) / library.name
         command = [sys.executable, "-m", "ziglang", "c++", *FLAGS]

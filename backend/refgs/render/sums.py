@@ -16,8 +16,8 @@ def pixel_sums(
 ) -> Tensor:
     """Sum an image over each surfel's pixels, weighted by the surfel's blending weights. Returns the sums (N, C).
 
-    The image (H, W, C) is made by `weigh` from the picture (H, W, C) of the surfels' `features` (N, C). The sums are computed as the
-    gradient of the features. Surfels nearer to the camera than `near` are not drawn.
+    The image (H, W, C) is made by `weigh` from the picture (H, W, C) of the surfels' `features` (N, C). The sums are computed by autograd:
+    they are the gradient of Σ picture · image by the features. Surfels nearer to the camera than `near` are not drawn.
     """
     features = features.detach().clone().requires_grad_()
     with torch.enable_grad():
@@ -33,7 +33,8 @@ def blended_shares(
     """Compute how much each surfel contributes to the pictures of V cameras (V, N): the sum of its blending weights over all pixels.
 
     If `maps` holds an image (H, W, C) for each camera, return instead the mean of these images for each surfel (N, C), weighted by its
-    blending weights. Surfels nearer to a camera than `near` are not drawn. Cameras and maps may be generators: one of each is held.
+    blending weights. Surfels nearer to a camera than `near` are not drawn. `cameras` and `maps` may be generators: only one camera and one
+    map are held in memory at a time.
     """
     surfels = Surfels(*(value.detach() for value in surfels))
     one = torch.ones_like(surfels.positions[:, :1])

@@ -95,7 +95,7 @@ def _relit_as_tensoir(
     pictures: Path,
     next_step: Callable[[str], None],
 ) -> dict[str, float]:
-    """Measure the views under another light, as means. Writes pictures of the `chosen` cameras.
+    """Measure the views of `cameras` under another light. Returns the mean "psnr" and "ssim". Writes pictures of the `chosen` cameras.
 
     Pictures are put over the run's background, which presets make white, in sRGB-encoded colours.
     """
@@ -118,7 +118,7 @@ def _stanford_orb(
 ) -> dict[str, Any]:
     """Measure as Stanford-ORB does: test views (`view`), the object in other scenes under their light (`light`), normals and depth.
 
-    PSNR-H is left out where photos are not EXR.
+    PSNR-H, the PSNR of linear radiance, is left out for photos that are not EXR files.
     """
     with_lpips, found = metrics.lpips_missing() is None, {}
     rows: dict[str, dict[str, list[float]]] = {"view": {}, "light": {}}
@@ -168,7 +168,7 @@ def _mask(loaded: LoadedView) -> np.ndarray:
 
 
 def _radiance(run: Run, rendering: Rendering) -> np.ndarray:
-    """Return what a rendering shows as linear radiance over black, float32 (h, w, 3)."""
+    """Convert a rendering's picture to linear radiance over black, float32 (h, w, 3). The picture has the run's background."""
     alpha = rendering.alpha.numpy()[..., None]
     over = rendering.color.numpy() - np.array(run.settings.image.background, np.float32) * (1 - alpha)
     return srgb_decode(np.maximum(over, 0))

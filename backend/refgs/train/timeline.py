@@ -1,7 +1,7 @@
-"""Tell when each thing is done in a training. Each has one row.
+"""Tell when each action of a training is done. Each action has one row.
 
 `Trainer.step` does what is due in BEFORE, renders a photo and takes a step of Adam, and then does what is due in AFTER.
-`scripts/timeline_page.py` prints all rows into docs/timeline.md. No other module of the training compares its progress with anything.
+`scripts/timeline_page.py` prints all rows into docs/timeline.md. No other module of the training compares its progress with a threshold.
 
 A training's progress is the fraction of its iterations that are done, 0..1.
 """
@@ -33,8 +33,8 @@ class Step:
     """Hold the facts of the iteration that is being done.
 
     `progress` is that of the training when the iteration begins. `done` counts finished iterations, and includes this one from Adam's step
-    on. `view` is the training view. `hidden` is the fraction of the object's pixels that mirror the object if this iteration has made a
-    mesh, else None. `photo` and `rendering` are set from Adam's step on.
+    on. `view` is the training view. `hidden` is None unless this iteration has made a mesh. Then it is the fraction of the object's pixels
+    that mirror the object. `photo` and `rendering` are set from Adam's step on.
     """
 
     photo: Photo
@@ -50,7 +50,7 @@ Test = Callable[[State, Step], bool]
 
 
 class When(NamedTuple):
-    """Hold a time of the training, or a condition. `holds` tells whether it has come, or is true. `words` describe it on the page."""
+    """Hold a time or a condition. `holds` tells whether it has come, or is true. `words` describe it in docs/timeline.md."""
 
     words: str
     holds: Test
@@ -61,7 +61,7 @@ class When(NamedTuple):
 
 
 class Every(NamedTuple):
-    """Hold a period. `length` computes it in iterations, 0 for never. `words` describe it on the page."""
+    """Hold a period. `length` computes it in iterations, 0 for never. `words` describe it in docs/timeline.md."""
 
     words: str
     length: Callable[[State], int]
@@ -77,9 +77,9 @@ ONCE = Every("once", lambda state: 1)
 
 
 class Row(NamedTuple):
-    """Tell when one thing is done: from `start` on and before `until`, in iterations that are multiples of `every`, if `only_if` holds.
+    """Tell when one action is done: from `start` on and before `until`, in iterations that are multiples of `every`, if `only_if` holds.
 
-    `clock` is the part of the training's time (`refgs.clock`) for which it counts. It is None if the thing keeps the time itself.
+    `clock` names the part of the training's time (`refgs.clock`) that includes the action; None if it measures its own.
     """
 
     what: str
@@ -214,7 +214,7 @@ def _resets(state: State, step: Step) -> bool:
 
 
 def _first_plan(state: State, step: Step) -> bool:
-    """Tell whether to plan the iterations now: 10 iterations after the plan began, when the pace is first known, and every 50th."""
+    """Tell whether to plan the iterations now: 10 iterations after `Plan.begin`, when their pace is known, then at every 50th iteration."""
     since = step.done - state.plan.first
     return since == 10 or (since > 0 and step.done % 50 == 0)
 

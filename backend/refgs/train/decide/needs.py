@@ -45,13 +45,13 @@ def evaluate(state: State, moment: Moment, given: Given = Given()) -> list[str]:
 
 
 def look_again(state: State, step: Step) -> None:
-    """Bring specular shading back, and all that was left out with it, if the scene halfway turns out not to be matte."""
+    """Bring back specular shading, and what was left out with it, if halfway through the training the scene proves not to be matte."""
     if decision := SPECULAR.look_again(state):
         _bring_back_specular(state, decision)
 
 
 def bring_back_specular(state: State, why: str) -> bool:
-    """Bring specular shading back, and all that was left out with it. `why` is the reason. Returns False if a setting left it out."""
+    """Bring back specular shading and what was left out with it. `why` is the reason. Returns False if it is on, or off by a setting."""
     if state.needed(SPECULAR.name) or SPECULAR.asked(state) != "auto":
         return False
     _bring_back_specular(state, Decision(True, why))

@@ -92,8 +92,8 @@ def ambiguities(state: State) -> dict[str, dict]:
     - `error`: how much the pictures differ from the photos.
     - `what`: a message for the user. It is present only if `left` is less than UNSEEN times `error`.
 
-    `alone`, `left` and `error` are root mean squares of differences of encoded colours. To measure how a change alters the pictures,
-    a small part of it is made, and the difference is scaled up to the whole change.
+    `alone`, `left` and `error` are root mean squares of differences of encoded colours. To measure how a change alters the pictures, the
+    change is made with the fraction SMALL of its strength. The difference is then divided by SMALL.
     """
     light = state.environment()
     if light is None:

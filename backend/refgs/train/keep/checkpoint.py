@@ -85,13 +85,13 @@ def load(folder: Path, report: Report = lambda event, facts: None) -> tuple[dict
 
 
 def set_aside(file: Path) -> None:
-    """Rename a file that cannot be read: DAMAGED is added to its name. Do nothing if it is not there, or in a folder that is read-only."""
+    """Rename a file that cannot be read: DAMAGED is added to its name. Do nothing if the file is missing or its folder is read-only."""
     with suppress(OSError):
         os.replace(file, file.with_name(file.name + DAMAGED))
 
 
 def _begun(folder: Path) -> list[int]:
-    """List the iterations that have the last file of a checkpoint, in ascending order."""
+    """List the iterations that have a TOML file, the last file of a checkpoint to be written, in ascending order."""
     return sorted(int(file.stem) for file in folder.glob("*.toml") if file.stem.isdecimal() and len(file.stem) == 8)
 
 

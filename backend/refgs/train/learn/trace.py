@@ -74,7 +74,7 @@ def make_mesh(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def trace_received(state: State, step: Step) -> None:
-    """Trace how much of the light each surfel receives. Do this with each new mesh, because light and mesh are better known by then."""
+    """Trace how much of the light each surfel receives. Called for each new mesh, because mesh and light improve during the training."""
     if state.occluder is None or "received" not in state.learned:
         return
     traced = Surfels(*(value.cpu() for value in with_normals_last(state.surfels())))

@@ -1,10 +1,11 @@
 """Tell mirroring surfaces from matte surfaces whose light changes from photo to photo.
 
-The light can change because of clouds, a lamp that is carried along, or the photographer's shadow. A matte surface then changes along its
-own colour, and looks like a coloured metal, which changes with the view.
+The light can change because of clouds, a lamp that is carried along, or the photographer's shadow. Then the radiance of a matte surface
+changes in the surface's own colour. The radiance of a coloured metal changes like this, too, when the view changes.
 
-Two models tell them apart. A change of the light is nearly linear in the surface normal in each photo (Ramamoorthi and Hanrahan 2001). It
-can be another linear function in each photo. A mirrored picture is one function of the mirror direction, which is the same in all photos.
+Two models are fitted to tell these apart. In the first, the light changes: in each photo, the change is nearly linear in the surface normal
+(Ramamoorthi and Hanrahan 2001), with other coefficients in each photo. In the second, the surface mirrors: the change is one function of
+the mirror direction, the same in all photos.
 """
 
 import math
@@ -31,11 +32,11 @@ CELL = 0.15  # side of a grid's cells, in scene radii: models are fitted to half
 
 
 class Explained(NamedTuple):
-    """Hold which fraction of the variance of a surface's changes is explained. It is measured on surfels that were not fitted to.
+    """Hold which fraction of the variance of a surface's changes each model explains. Models were fitted to other surfels.
 
-    - `lit`: by a light that changed, as a linear function of the normal that differs from photo to photo.
-    - `mirrored`: by an exposure of each photo and one function of the mirrored direction.
-    - `both`: by both together.
+    - `lit`: the light changes: for each photo, a linear function of the normal.
+    - `mirrored`: the surface mirrors: one function of the mirror direction, and an exposure for each photo.
+    - `both`: both models together.
 
     All are NaN if too few surfels are seen.
     """
@@ -65,10 +66,10 @@ class Explained(NamedTuple):
 
 @torch.no_grad()
 def explained(observations: Observations, positions: Tensor, radius: float, *parts: Tensor) -> list[Explained]:
-    """Measure how well a changed light, and how well mirroring, explains the way that parts of a surface change with the view.
+    """Measure how well a changing light explains the way that parts of a surface change from photo to photo, and how well mirroring does.
 
     Changes and normals are averaged over neighbours. Each of `parts` (N,) is a mask of surfels, and gets one result. `radius` is the
-    scene's.
+    scene's radius in world units.
     """
     near = neighbours(positions, SMOOTHED)
     mean, change, known = averaged(observations, near)
