@@ -53,7 +53,7 @@ def frames(
     out: Annotated[Path, typer.Option(help="folder for the photos: OUT/images/frame_0001.jpg …")],
     count: Annotated[int, typer.Option(min=3, max=1000, help="number of photos, less those that are left out")] = 100,
 ) -> None:
-    """Choose sharp photos from a video, evenly over its time. Leave out blurred ones, and those between which the camera stood still."""
+    """Choose sharp photos from a video, evenly over its time. Leave out blurred photos, and repeats taken while the camera stood still."""
     from refgs import commands
 
     commands.frames(video, out, count)
@@ -259,7 +259,7 @@ def _terminate(*_) -> None:
 
 
 def _end_with_input() -> None:
-    """End this process as SIGTERM does when its standard input closes: what started it has died, and waits for it no longer."""
+    """End this process by SIGTERM when its standard input closes: the process that started it has died."""
     while os.read(0, 1024):
         pass
     os.kill(os.getpid(), signal.SIGTERM)
@@ -280,7 +280,8 @@ def _one_line(show):
 def main() -> None:
     """Run a command. Its exit status is one of STATUSES; an error prints one line, a fault of the program a traceback.
 
-    If the environment has REFGS_END_WITH_INPUT, the command also ends when its standard input closes. `refgs batch` starts commands so.
+    If the environment has REFGS_END_WITH_INPUT, the command also ends when its standard input closes. `refgs batch` sets it for the
+    commands that it starts.
     """
     for stream in (sys.stdout, sys.stderr):  # a path may hold what the terminal's encoding lacks
         if isinstance(stream, io.TextIOWrapper):
@@ -302,7 +303,7 @@ def main() -> None:
 
 
 def _end(status: int, said: str) -> NoReturn:
-    """Print to the standard error, and exit. What cannot be printed, for the disk of a log is full, does not change the status."""
+    """Print a message to the standard error, and exit with `status`, even if printing fails because a log's disk is full."""
     with suppress(OSError):
         sys.stderr.write(said)
         sys.stderr.flush()

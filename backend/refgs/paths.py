@@ -38,8 +38,8 @@ def whole(path: str | os.PathLike, durable: bool = True) -> Iterator[Path]:
     Yields a temporary file, empty and in the same folder, to write to. It is renamed to `path` at the end of the `with` block, or deleted
     if the block raises an error. A killed process leaves it behind: see `remove_leftovers`.
 
-    The file is on the disk when the block ends, so that it outlives a power failure. `durable=False` leaves that out, which takes
-    milliseconds, for files that are of no use then.
+    The file is on the disk when the block ends, so that it outlives a power failure. `durable=False` saves the milliseconds that this
+    takes, for files that nobody needs after a power failure.
     """
     path = Path(path)
     temporary = path.with_name(f".refgs-{secrets.token_hex(8)}.tmp")
@@ -93,7 +93,7 @@ def write_text(file: Path, text: str, durable: bool = True) -> None:
 
 
 def read_text(file: Path, again: str) -> str:
-    """Read a text file in UTF-8. Raises InputError, which ends with `again`, if it is missing, no file of text, or larger than LARGEST."""
+    """Read a text file. Raises InputError if it is missing, not UTF-8 text, or larger than LARGEST. `again` ends the error's message."""
     try:
         if _is_special(file):
             raise InputError(f"{file}: this is not a file. {again}")
@@ -111,7 +111,7 @@ def read_text(file: Path, again: str) -> str:
 
 
 def _is_special(file: Path) -> bool:
-    """Tell whether a folder is there, or a pipe or device, which may have no end."""
+    """Tell whether a path is a folder, a pipe or a device. A pipe or device may have no end."""
     return file.exists() and not file.is_file()
 
 
@@ -140,8 +140,8 @@ def _check_ordinary(file: Path) -> None:
 def disk_errors_named(folders: list[Path], again: str) -> Iterator[None]:
     """Raise TryAgain for disk errors in a `with` block. The message names the folder whose disk is full, read-only or gone.
 
-    The folders must exist; without folders, files may be read in the block, too. `again` is added to the message: it tells the user how to
-    continue when the disk works again.
+    The block writes to `folders`, which must exist. If `folders` is empty, the message also allows for a failed read. The message contains
+    `again`, which tells the user how to continue when the disk works again.
     """
     try:
         yield

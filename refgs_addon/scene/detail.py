@@ -11,9 +11,10 @@ LEVELS = (1.0, 0.25, 0.05)  # parts of the splats and triangles
 
 
 def set_detail(collection: bpy.types.Collection, level: float) -> None:
-    """Show only a part of a run's splats and of its mesh's triangles. `level` is that part, 0 to 1.
+    """Show only the fraction `level`, 0 to 1, of a run's splats and of its mesh's triangles.
 
-    The splats that are shown are enlarged, so that they cover the same surface."""
+    The splats that are shown are enlarged, so that they cover the same surface.
+    """
     found = parts(collection)
     for splats in found.get("splats", []):
         if SPLATS in splats.modifiers:

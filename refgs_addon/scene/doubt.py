@@ -14,7 +14,7 @@ DISPLAY = "Doubt"  # of the splats' modifier
 
 
 def has_doubt(collection: bpy.types.Collection) -> bool:
-    """Tell whether a run says where its photos do not tell metal from paint."""
+    """Tell whether a run's splats have an attribute of doubt, which shows where photos do not tell metal from paint."""
     return any("doubt" in splats.data.attributes for splats in parts(collection).get("splats", []))
 
 
@@ -33,11 +33,10 @@ def doubt_shown(collection: bpy.types.Collection) -> bool:
 
 
 def show_doubt(collection: bpy.types.Collection, on: bool) -> None:
-    """Colour a run's splats and mesh by their doubt, without lighting, or undo that.
+    """Colour a run's splats and mesh by their doubt, without lighting. If `on` is false, show them shaded again.
 
-    They are orange where photos do not tell metal from paint, and grey where they do.
-
-    The mesh has the run folder's texture of doubt. Raises InputError if the mesh is shown and there is no such texture.
+    A surface is orange where photos do not tell metal from paint, and grey where they do. The mesh's colours come from the texture of doubt
+    in the run folder. Raises InputError if the mesh is shown and this texture is missing.
     """
     from .export_run import run_folder  # needs numpy, which Debian's Blender may lack
     from .mesh_exchange import TEXTURES

@@ -58,7 +58,7 @@ def is_edited(splats: bpy.types.Object) -> bool:
 
 
 def remove_edit(splats: bpy.types.Object, name: str) -> None:
-    """Remove an edit, and the object that marks where it applies. Another edit may use this object too: then it stays."""
+    """Remove an edit. Also remove the object that marks where it applies, unless another edit uses this object, too."""
     edit = splats.modifiers.get(name)
     if edit is None or edit not in edits(splats):
         raise InputError(f"{splats.name} has no edit {name}")

@@ -35,7 +35,7 @@ def add_region(splats: bpy.types.Object, collection: bpy.types.Collection, name:
 
 
 def bounds(cloud: bpy.types.PointCloud) -> tuple[Vector, Vector]:
-    """Return the lowest and the highest corner of the box around a point cloud. On each of its sides, 2 % of the points are left out."""
+    """Return the lowest and the highest corner of the box around a point cloud. 2 % of the points may lie beyond each side of the box."""
     places = [0.0] * (3 * len(cloud.points))
     cloud.attributes["position"].data.foreach_get("vector", places)
     axes = [sorted(places[axis::3]) for axis in range(3)]
@@ -86,7 +86,8 @@ def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
 def show_guessed_region(scene: bpy.types.Scene, centre: list[float], radius: float) -> None:
     """Add the box in which masks will look for the object, unless the scene has a training box.
 
-    It limits no training until the artist changes it, or presses Add Region. `centre` and `radius` are what the cameras look at.
+    It limits no training until the artist changes it, or presses Add Region. The cameras look at the sphere with this `centre` and
+    `radius`.
     """
     if training_region(scene) is None:
         box = _new_training_region(scene)
@@ -106,10 +107,10 @@ def _is_guess(scene: bpy.types.Scene, box: bpy.types.Object) -> bool:
 
 
 def show_found_region(scene: bpy.types.Scene, settings: list[str]) -> bpy.types.Object:
-    """Make the training box the box in which masks found the object, or move it there, with some room around it.
+    """Move the training box to where the masks found the object, with some room around it. Make the box if there is none.
 
-    `settings` are the trainer's, as "region.size=[1, 1, 2]". The box counts as found by the program (`artists_region`) until the artist
-    changes it.
+    `settings` are settings of the trainer, such as "region.size=[1, 1, 2]". The box counts as found by the program (`artists_region`) until
+    the artist changes it.
     """
     values = {key: json.loads(value) for key, value in (word.split("=", 1) for word in settings)}
     box = training_region(scene) or _new_training_region(scene)
@@ -123,7 +124,7 @@ def show_found_region(scene: bpy.types.Scene, settings: list[str]) -> bpy.types.
 
 
 def artists_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Find the training box if an artist made, moved or scaled it. Returns None if there is none, or if it is as the program placed it."""
+    """Find the training box if an artist made, moved or scaled it. Returns None if there is no box, or if only the program placed it."""
     box = training_region(scene)
     if box is None or FOUND not in box:
         return box
@@ -160,7 +161,7 @@ def _looked_at(scene: bpy.types.Scene) -> tuple[Vector, float]:
 
 
 def region_settings(scene: bpy.types.Scene) -> dict[str, list[float]]:
-    """Return the trainer's settings for the scene's training box, or {} if there is no box, or a guess only.
+    """Return the trainer's settings for the scene's training box. Return {} if there is no box, or only a guessed one.
 
     Only what is inside the box is trained, and its Z axis becomes the result's up direction. Raises InputError if the box has no volume.
     """

@@ -67,9 +67,9 @@ def extract_photos(scene: bpy.types.Scene, video: Path, out: Path | None, count:
 def make_masks(scene: bpy.types.Scene) -> jobs.Job:
     """Start a job that makes masks for the scene's capture, and then checks the capture.
 
-    The trainer looks for the object in the box that limits the training, if the artist placed one; otherwise in the middle of what the
-    cameras look at. It asks the model of the preferences, if one is chosen. When the job is done, the capture's cameras are shown, with the
-    box around the object among them: masks change the frame of both. Canvases of strokes show the new masks.
+    The trainer looks for the object in the training box, if the artist placed one; otherwise in the middle of what the cameras look at. If
+    a model is chosen in the preferences, the trainer finds the object with it. Masks change the frame of the capture. So when the job is
+    done, the cameras and the box around the object are shown at their new places. Canvases of strokes show the new masks.
     """
     capture, mine = _capture(scene), artists_region(scene) is not None
     settings = region_settings(scene) if mine else {}
@@ -93,8 +93,8 @@ def make_masks(scene: bpy.types.Scene) -> jobs.Job:
 def _show_masks(number: int, capture: Path, found: dict) -> None:
     """Show masks that were just made: on canvases of strokes, and as the box around the object.
 
-    If the artist placed the box, move it with the capture's frame instead. `found` is the trainer's result of making masks. `number` is the
-    scene's `session_uid`.
+    A box that the artist placed is not replaced. It moves as the new masks move the capture's frame. `found` is the trainer's result of
+    making masks. `number` is the scene's `session_uid`.
     """
     strokes.show_masks(capture)
     if known := _scene(number):
@@ -116,10 +116,10 @@ def save_strokes(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def train_other_way(scene: bpy.types.Scene, folder: Path, need: str) -> jobs.Job:
-    """Start a job that trains as `train` does, but with the opposite of the decision about a need that the run in `folder` made.
+    """Start a job that trains as `train` does, but reverses one decision of the run in `folder`: whether the scene needs `need`.
 
-    The result goes into a new folder beside that run. Where the scene has a property for the need, it gets the other answer. Raises
-    InputError as `train` does, and if the run's capture is not the scene's.
+    The result goes into a new folder beside that run. If the scene's settings have a property for this need, it gets the reversed answer.
+    Raises InputError as `train` does, and if the run's capture is not the scene's.
     """
     decision, settings, trained = find_decision(folder, need), scene.refgs, _trained_capture(scene, folder)
     if trained is not None and trained.resolve() != _capture(scene).resolve():

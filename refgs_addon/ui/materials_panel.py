@@ -86,7 +86,7 @@ class RemoveEdit(_OfEdit, bpy.types.Operator):
 class SetMaterial(_OfEdit, bpy.types.Operator):
     """Set the values of an edit to those of a material preset.
 
-    Blender's own operator does the same, but the artist could not undo it.
+    Blender's own operator does the same, but its changes cannot be undone.
     """
 
     bl_idname = "refgs.set_material"

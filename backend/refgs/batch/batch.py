@@ -44,7 +44,7 @@ class _Run:
 
     @property
     def failed(self) -> tuple[str, Outcome] | None:
-        """Return the first step that failed, with its outcome. Masks count only if the training failed, too."""
+        """Return the name and outcome of the first failed step, or None. Masks are skipped: if they matter, the training fails, too."""
         bad = [(name, found) for name in self.nodes if (found := self.outcomes.get(name)) and found.status]
         return next((pair for pair in bad if pair[0] not in OPTIONAL), None)
 
@@ -74,10 +74,10 @@ class Batch:
         self._jobs = read_jobs(source, out, ask)
 
     def run(self, engine: Engine, stop: Callable[[int, int, float], bool]) -> int:
-        """Run all steps. Returns the exit status: 0 if all is done, otherwise the one that the worst failure calls for.
+        """Run all steps. Returns the exit status: 0 on success, TRY_AGAIN if the batch was stopped or a failure may pass, else 1 or 2.
 
-        `stop(done, total, seconds)` is called about once a second. If it returns True, all commands are ended, with checkpoints.
-        Captures that are added meanwhile are trained, too.
+        `stop(done, total, seconds)` is called about once a second. If it returns True, all commands are ended; trainings write checkpoints
+        first. Captures that are added while the batch runs are trained, too.
         """
         if self._device == "cuda" and not engine.cards:
             raise InputError("--device cuda: no machine here has a CUDA card that Ray knows of: take auto or cpu")
@@ -157,12 +157,12 @@ class Batch:
         self._report("ended", {"run": run.job.name, "what": f"{run.job.name}: {what}"})
 
     def _look(self, run: _Run) -> None:
-        """Read what a run has to show by now."""
+        """Read the figures and the picture that a run has so far."""
         folder = self._out / run.job.name
         run.figures, run.picture = figures_of(folder), picture_of(folder)
 
     def _tell(self) -> None:
-        """Report how many runs have ended, and what is being done for the others. Write the table every WRITE_EVERY seconds."""
+        """Report how many runs have ended, and which steps the others are at. Write the table if WRITE_EVERY seconds have passed."""
         working = []
         for run in self._runs.values():
             for name in run.working():
@@ -175,7 +175,7 @@ class Batch:
             self._write_rows()
 
     def _added(self) -> list[Job]:
-        """Read the list again, and return the trainings that were added. If it is wrong now, warn once."""
+        """Read the list of captures again. Return the trainings that were added, none if the list has an error. Warn once of each error."""
         self._looked = time.monotonic()
         try:
             jobs = read_jobs(self._source, self._out, self._ask)
@@ -204,10 +204,11 @@ def ready(
     workers: int | None = None,
     address: str | None = None,
 ) -> Iterator[Callable[[Callable[[], bool]], int]]:
-    """Check a batch, start Ray and lock the folder of the runs, for a `with` block. The arguments are the options of `refgs batch`.
+    """Check a batch, start Ray and lock the folder of the runs, for a `with` block. Arguments are as for `refgs batch`.
 
     Yields the function run(stop), which runs the batch and returns its exit status. `stop()` is called about once a second. If it returns
-    True, all commands are ended, trainings with checkpoints. Raises InputError if something is wrong with the captures, Ray or the folder.
+    True, all commands are ended; trainings write checkpoints first. Raises InputError if something is wrong with the captures, Ray or the
+    folder.
     """
     work = Batch(source, out, ask, device, report)
     with started(address, cores, workers) as engine:
@@ -222,7 +223,7 @@ def ready(
 
 
 def _progress(run: Path) -> tuple[int, int]:
-    """Return the iteration of a training that runs in a folder, and their total. Both are 0 if that is not known."""
+    """Return the present iteration of the training in the folder `run`, and its total of iterations. Both are 0 if they are not known."""
     try:
         facts = read_json(run / PROGRESS, Progress, "")
     except InputError:
@@ -231,7 +232,7 @@ def _progress(run: Path) -> tuple[int, int]:
 
 
 def _settled(capture: Path) -> bool:
-    """Return whether a folder's files are complete: nothing has changed for SETTLED seconds, so that nothing is being copied still."""
+    """Tell whether a capture's files are complete. Files that changed less than SETTLED seconds ago may still be being copied."""
     try:
         changed = max(path.stat().st_mtime for path in [capture, *capture.rglob("*")])
     except OSError:

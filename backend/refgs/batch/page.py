@@ -24,9 +24,9 @@ SHOWN = ("psnr", "ssim", "flip", "splats")
 class Row(NamedTuple):
     """Hold a run's row in the tables.
 
-    `state` is "waiting", "running", "done", "failed" or "stopped". A running run is at the `step`, of which the fraction `part` is done, 0
-    … 1, or None if that is not known. `what` says in one line what failed, and `log` is the file that says more. `figures` are its metrics,
-    and `picture` is its first held-out view as rendered.
+    `state` is "waiting", "running", "done", "failed" or "stopped". A running run is at the step `step`. `part`, 0 … 1, is how much of this
+    step is done; it is None if that is not known. `what` says in one line what failed, and `log` is the file that says more. `figures` are
+    the run's metrics, and `picture` is its first held-out view as rendered.
     """
 
     name: str
@@ -82,7 +82,7 @@ def write_page(out: Path, rows: list[Row], seconds: float) -> None:
 
 
 def figures_of(run: Path) -> dict[str, float]:
-    """Read a run's metrics as a flat dict. A broken file counts as none: the run's own report says more."""
+    """Read a run's metrics as a flat dict. Return {} if the file is missing or broken: the run's own report names the error."""
     try:
         return dict(flatten(run_metrics(run)))
     except (OSError, ValueError, InputError):

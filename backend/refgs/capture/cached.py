@@ -1,7 +1,7 @@
-"""Load a capture's photos for training. Many large ones are written into files and mapped: the system can then reclaim their memory.
+"""Load a capture's photos for training. Large captures are cached: photos are mapped from files, so that the system can free their memory.
 
-A photo's files are named by a hash of all that its pixels depend on. A resumed training reuses the files that still fit, and makes the
-others anew.
+A photo's files are named by a hash of all that its pixels depend on. A resumed training reuses files whose names are still right, and
+writes the others again.
 """
 
 import hashlib
@@ -46,7 +46,7 @@ def load_views(views: list[View], max_side: int, folder: Path) -> list[LoadedVie
 
 
 def reduced_views(views: list[LoadedView], factor: int, folder: Path) -> list[LoadedView]:
-    """Reduce the sides of loaded photos by a factor, in linear light as `load_view` does. If `folder` exists, cache them there, too.
+    """Reduce the sides of loaded photos by a factor, in linear light as `load_view` does. If `folder` exists, cache the results in it.
 
     If photos are mapped, only one at a time is in memory.
     """
@@ -101,7 +101,7 @@ def _read(camera: Camera, folder: Path, name: str) -> LoadedView | None:
 
 
 def _mapped(file: Path, shape: tuple[int, ...], *kinds: type) -> np.ndarray:
-    """Map an array from a file. Raises any exception if it is damaged, or has another shape, or none of these types."""
+    """Map an array from a file. Raises an exception of any type if the file is damaged, or has another shape, or a dtype not in `kinds`."""
     values = np.asarray(np.load(file, mmap_mode="c"))  # not "r", as torch warns of arrays that it must not write
     if values.shape != shape or values.dtype not in kinds:
         raise ValueError("another array")

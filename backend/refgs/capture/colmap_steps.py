@@ -1,6 +1,6 @@
 """Call COLMAP (pycolmap) for each step of structure from motion: features, matches and cameras.
 
-`motion.find_cameras` decides which steps to take, and judges what they find.
+`motion.find_cameras` decides which steps to take, and judges the cameras found.
 """
 
 import shutil
@@ -191,8 +191,8 @@ def map_one_by_one(photos: list[Path], database: Path, progress: Callable) -> li
 def map_at_once(photos: list[Path], database: Path) -> list[Any]:
     """Compute all cameras together (GLOMAP). Return the models as `map_one_by_one` does.
 
-    This links photos that share too little to be placed one after the other. Some photos are placed by their direction alone, and not by
-    points that several photos show. They lose their cameras, because their distance is not known.
+    GLOMAP also links photos that share too little to be placed one after the other. It places some photos by their direction alone, without
+    points that several photos show. Their distance is not known, so this function removes their cameras.
     """
     import pycolmap
 
@@ -248,8 +248,8 @@ def epipolar_distance(ours: np.ndarray, theirs: np.ndarray, pose: np.ndarray) ->
 def unexplained_part(model: Any, database: Path) -> float:
     """Return the fraction of feature matches that the cameras of a model (a pycolmap.Reconstruction) do not explain.
 
-    A match is explained if its points are at most MATCH_TOLERANCE pixels from their epipolar lines, and both its photos have cameras. The
-    second condition counts if an object turns before a still room: photos that follow the room may get no camera.
+    A match is explained if both its photos have cameras, and its points are at most MATCH_TOLERANCE pixels from their epipolar lines.
+    Photos without cameras matter if an object turns before a still room: photos that follow the room may get no camera.
     """
     import pycolmap
 

@@ -1,7 +1,7 @@
 """Load photos and masks for training: decode, undistort and reduce them. The results are sRGB codes with straight alpha.
 
-Most photos have 8-bit codes, and keep them. Photos with more (16-bit PNG and TIFF, camera RAW, EXR) have 16-bit codes. In an EXR the code
-of white is not the largest, so that brighter radiance can be told apart.
+Photos with 8 bits a channel are loaded as 8-bit codes. Photos with more bits (PNG and TIFF with 16, camera RAW, EXR) are loaded as 16-bit
+codes. In an EXR, codes above that of white stand for brighter radiance.
 """
 
 import math
@@ -71,7 +71,7 @@ class LoadedView:
 
     @property
     def clipped(self) -> np.ndarray:
-        """Return where each channel (H, W, 3) is clipped, or nearly so: JPEG does not keep the largest code exactly."""
+        """Tell which channels of the pixels are clipped, bool (H, W, 3). JPEG changes codes a little, so nearly clipped ones count, too."""
         return self.image >= np.iinfo(self.image.dtype).max // 255 * 254
 
 
@@ -128,8 +128,8 @@ def read_image(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | No
     """Decode an image file to RGB (H, W, 3) uint8 and alpha (H, W) uint8, None without alpha.
 
     The image is turned upright by its EXIF orientation. Greyscale files and those with more than 8 bits are converted to 8-bit RGB.
-    `shrink` may be 2, 4 or 8: a JPEG is decoded at that fraction of its size, or a larger one that divides its sides, and RAW at half its
-    size. Raises InputError naming the file if it is truncated or unreadable.
+    `shrink` may be 2, 4 or 8: a JPEG's sides are divided by it. If it does not divide them evenly, it is halved until it does. A RAW
+    photo's sides are halved at most. Raises InputError naming the file if it is truncated or unreadable.
     """
     image, alpha, white = read_codes(path, shrink)
     return _as_bytes(image, white), alpha
@@ -209,10 +209,10 @@ def read_mask(path: Path, below: float | None = None) -> np.ndarray:
 
 
 def read_alpha(view: View) -> np.ndarray | None:
-    """Return a photo's mask (H, W) uint8, None if it has none. It is upright, not undistorted, and has the photo's full size.
+    """Return a photo's mask (H, W) uint8, or None if it has none. The mask has the photo's full size, and is upright but not undistorted.
 
-    A mask file without an EXIF orientation may be stored in its photo's orientation. If it fits the photo's size only then, it is turned
-    with the photo.
+    Some mask files have no EXIF orientation, but are stored in the orientation of their photo. A mask file that does not have the size of
+    the upright photo is therefore turned as the photo's EXIF says.
     """
     if view.mask_path is None:
         return read_image(view.image_path)[1] if view.has_alpha else None
@@ -232,7 +232,7 @@ def load_view(view: View, max_side: int | None = None) -> LoadedView:
 
     When a photo is reduced, linear radiance is averaged over each new pixel's area, as a coarser sensor would do. The average is weighted
     by alpha, so that colours outside the mask do not bleed into its edge. A much larger JPEG is first reduced by its decoder, to SPARE
-    times the new size or more. The decoder averages encoded values, and does so across a mask's edge, too.
+    times the new size or more. The decoder averages encoded values, and ignores the mask.
 
     Raises InputError naming the file.
     """
@@ -287,7 +287,7 @@ def _open(path: Path) -> ImageFile.ImageFile:
 
 
 def _turns(picture: Image.Image) -> int:
-    """Return the clockwise quarter turns that make an opened picture upright. Pillow itself turns TIFF, and libheif HEIC."""
+    """Return the clockwise quarter turns that make an opened picture upright: 0 for TIFF and HEIC, which their decoders turn."""
     if picture.format in ("TIFF", "HEIF"):
         return 0
     try:
@@ -317,7 +317,7 @@ def _decode(picture: Image.Image, path: Path) -> Image.Image:
 
 
 def _as_array(picture: Image.Image) -> np.ndarray:
-    """Copy a picture to an array (H, W, C) uint8, in strips, because Pillow copies once more what it returns."""
+    """Copy a picture to an array (H, W, C) uint8, strip by strip: Pillow makes one more copy of all that it converts at once."""
     pixels = np.empty((picture.height, picture.width, len(picture.getbands())), np.uint8)
     for top in range(0, picture.height, ROWS):
         bottom = min(top + ROWS, picture.height)
@@ -328,7 +328,8 @@ def _as_array(picture: Image.Image) -> np.ndarray:
 def _decode_16_bit(picture: ImageFile.ImageFile, path: Path) -> np.ndarray | None:
     """Decode a PNG or TIFF with 16 bits a channel to RGB or RGBA uint16 (H, W, 3 | 4). Return None for other pictures.
 
-    Pillow keeps the upper 8 bits of colours, so OpenCV decodes them. It does not detect a truncated file, but Pillow does.
+    OpenCV decodes the colours, because Pillow keeps only their upper 8 bits. Pillow first checks that the file is not truncated, which
+    OpenCV does not.
     """
     if picture.format not in ("PNG", "TIFF") or ";16" not in str(picture.tile) or "transparency" in picture.info:
         return None

@@ -1,4 +1,4 @@
-"""Match features between photos, and measure how far the given cameras are from agreeing with them."""
+"""Match features between photos, and measure how well the given cameras agree with the matches."""
 
 from typing import NamedTuple
 
@@ -35,9 +35,9 @@ class Matches(NamedTuple):
 def match_neighbours(views: list[LoadedView]) -> list[Matches]:
     """Match some photos, evenly spread, each with the photo of the nearest camera. Only pixels inside the masks are matched.
 
-    The matches of a pair fit one epipolar geometry, whatever the cameras are. Pairs with hardly any matches are left out. So are pairs most
-    of whose matches fit none, because seven matches always fit one, and some more fit by chance. Mirror images may be among the matches,
-    although they are not at rest on the mirror.
+    The matches of a pair fit one epipolar geometry, which is found from the matches alone and not from the cameras. Pairs with fewer than
+    LEAST matches are left out. So are pairs of which most matches fit no common epipolar geometry: the few that fit one may do so by
+    chance. Matches of mirror images may remain, although mirror images move over the surface when the camera moves.
     """
     if len(views) < 2:
         return []
@@ -56,8 +56,8 @@ def match_neighbours(views: list[LoadedView]) -> list[Matches]:
 def pixels_apart(matches: list[Matches], cameras: list[Camera]) -> float | None:
     """Return how far matches are from their epipolar lines, in pixels of photos reduced to SIDE.
 
-    The result is the lower quartile of the pairs' medians, because mirror images contradict correct cameras. It is None if there are fewer
-    than LEAST_PAIRS pairs. `cameras` are those of the matched views, in the same order.
+    The result is the lower quartile of the pairs' medians, or None if there are fewer than LEAST_PAIRS pairs. A mean would be too high,
+    because matches of mirror images contradict even correct cameras. `cameras` are those of the matched views, in the same order.
     """
     medians = []
     for pair in matches:

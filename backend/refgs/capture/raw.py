@@ -46,7 +46,7 @@ def read_raw_header(path: Path) -> tuple[int, int, int]:
 
 
 def read_raw(path: Path, half: bool = False) -> np.ndarray:
-    """Read a RAW photo as linear radiance (H, W, 3) uint16, as stored. A value is WHITE where the sensor is saturated.
+    """Read a RAW photo as linear radiance (H, W, 3) uint16, not turned upright. A value is WHITE where the sensor is saturated.
 
     With `half`, each 2×2 sensor pixels make one pixel, which needs no interpolation. All photos of a camera have the same scale: a value
     depends on the light and the exposure alone, not on what else is in the photo. Raises InputError naming the file.
@@ -68,7 +68,7 @@ def read_raw(path: Path, half: bool = False) -> np.ndarray:
 
 
 def read_exif(path: Path) -> dict[int, Any]:
-    """Read a RAW photo's EXIF tags, from the file or from the preview in it. Raises any exception if there are none."""
+    """Read a RAW photo's EXIF tags, from the file or from the preview in it. Raises an exception of any type if it has no EXIF."""
     exif = Image.Exif()
     try:
         with path.open("rb") as file:

@@ -21,7 +21,7 @@ def reduced(
     """Undistort a photo by `lens` and reduce it from the size of `camera` to that of `fitted`. Returns its codes and alpha.
 
     `image` (H, W, 3) are sRGB codes, uint8 or uint16, in which `white` is the code of 1. `alpha` (H, W) is uint8 or None. Linear radiance
-    is averaged over each new pixel's area, weighted by alpha. Without alpha, the result has none; else fully transparent pixels are black.
+    is averaged over each new pixel's area, weighted by alpha. The new alpha is None if `alpha` is; else fully transparent pixels are black.
     """
     size = fitted.height, fitted.width
     codes, opaque = np.empty((*size, 3), image.dtype), None if alpha is None else np.empty(size, np.uint8)

@@ -53,7 +53,7 @@ def triangulate(views: list[View], progress: Callable[[int, int], None]) -> np.n
 
 
 def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
-    """Choose pairs of cameras to match: each with those that look from the most similar places, but not from the same."""
+    """Choose pairs of cameras to match: each with NEIGHBOURS near ones that look in directions about ANGLE apart. Returns index pairs."""
     position = np.array([camera.position for camera in cameras])
     forward = np.array([camera.world_to_camera[2, :3] for camera in cameras])
     angle = np.degrees(np.arccos(np.clip(forward @ forward.T, -1, 1)))

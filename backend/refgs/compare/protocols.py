@@ -1,7 +1,7 @@
 """Measure errors as the authors of published data sets do, so that the figures can stand beside published ones.
 
-TensoIR is `renderer.py` and `scripts/relight_importance.py` of TensoIR's repository (Jin et al., CVPR 2023). Stanford-ORB is
-`orb/utils/metrics.py` and `orb/utils/test.py` of Stanford-ORB's repository (Kuang et al., NeurIPS 2023). Masks are (h, w) in 0..1.
+"TensoIR's" means as in `renderer.py` and `scripts/relight_importance.py` of its repository (Jin et al., CVPR 2023). "Stanford-ORB's" means
+as in `orb/utils/metrics.py` and `orb/utils/test.py` of its repository (Kuang et al., NeurIPS 2023). Masks are (h, w) in 0..1.
 """
 
 import cv2
@@ -58,14 +58,16 @@ def eroded(mask: np.ndarray) -> np.ndarray:
 def similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray, scaled: bool, lpips: bool) -> dict[str, float]:
     """Measure how alike a rendering and a photo are, as Stanford-ORB does. Both are linear radiance (h, w, 3). Returns by name:
 
-    - psnr_h: PSNR of radiance clipped at MOST_RADIANCE. Both are first multiplied by one factor: the mean of the sRGB-encoded photo
-      divided by the mean of the linear photo. The peak is 1 nevertheless.
-    - psnr_l: PSNR of sRGB-encoded pictures, clipped to 0..1
-    - ssim: of these, with a Gaussian window of 3×3 pixels and σ 1.5
-    - lpips, if it is wanted: with VGG-16, of these sRGB-encoded once more. Stanford-ORB's program does so.
+    - psnr_h: PSNR of radiance clipped at MOST_RADIANCE. Both are first multiplied by one factor: the mean of the sRGB-encoded photo divided
+      by the mean of the linear photo. The peak is 1 nevertheless.
+    - psnr_l: PSNR of the pictures after clipping to 0..1 and sRGB encoding
+    - ssim: SSIM of these encoded pictures, with a Gaussian window of 3×3 pixels and σ 1.5
+    - lpips, only if the argument `lpips` is true: LPIPS (VGG-16) of these encoded pictures after a second sRGB encoding, as in
+      Stanford-ORB's program
 
-    Both pictures are black outside the eroded mask, and these pixels count. If `scaled`, each channel of the rendering is first multiplied
-    by its least-squares factor, as for pictures under another light. No PSNR is below that of a grey of 0.5.
+    Both pictures are black outside the eroded mask, and means include this black. If `scaled`, each channel of the rendering is first
+    multiplied by its least-squares factor, as for pictures under another light. A PSNR below that of a uniform grey of 0.5 is replaced by
+    the grey's.
     """
     inside = eroded(mask > 0.5)[..., None]
     image, photo = (np.where(inside, np.maximum(x, 0), 0).astype(np.float64) for x in (image, photo))

@@ -43,7 +43,7 @@ def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
 def read_exr_header(path: str | os.PathLike) -> tuple[int, int, bool]:
     """Read the width, the height, and whether there is alpha, of the part that `read_exr` reads. No pixels are decoded.
 
-    Raises InputError if the file is missing or broken, or if it holds less or more than the whole picture.
+    Raises InputError if the file is missing or broken, or if its pixels are a crop of the picture or exceed it (overscan).
     """
     path = Path(path)
     if not path.is_file():
@@ -66,8 +66,8 @@ def read_exr_header(path: str | os.PathLike) -> tuple[int, int, bool]:
 def read_exr(path: str | os.PathLike) -> np.ndarray:
     """Read an EXR file as float32: (H, W, 4) for RGBA, (H, W, 3) for RGB, or (H, W) for a single channel.
 
-    If the file has several parts, the first part with R, G and B is read. If no part has them, the first part is read. Without R, G and B
-    the part must have one channel. Raises InputError if it does not, or if the file is missing or broken.
+    If the file has several parts, the first part with R, G and B is read. If no part has them, the first part is read. Raises InputError if
+    that part has several channels, or if the file is missing or broken.
     """
     path = Path(path)
     if not path.is_file():

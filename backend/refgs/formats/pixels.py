@@ -11,9 +11,9 @@ SMALL, MOST_PER_BYTE = 100_000_000, 10_000
 
 
 def check_pixels(path: Path, width: int, height: int, small: int = SMALL, per_byte: int = MOST_PER_BYTE) -> None:
-    """Raise InputError if a picture's file declares more pixels than are read, or far more than it can hold.
+    """Raise InputError if a picture's file declares more than MOST pixels, or more pixels than the file can hold.
 
-    That is more than `small` in all and more than `per_byte` for each byte of the file.
+    The file is taken to hold at most `per_byte` pixels for each of its bytes, or `small` pixels if that is more.
     """
     size = f"{path}: {width}×{height} pixels"
     if width * height > MOST:
@@ -23,7 +23,7 @@ def check_pixels(path: Path, width: int, height: int, small: int = SMALL, per_by
 
 
 def check_chunks(path: Path) -> None:
-    """Raise InputError if a PNG declares more bytes than it has. OpenCV would take memory for them. Other files are left alone.
+    """Raise InputError if a PNG declares more bytes than it has: OpenCV would allocate as many as declared. Other formats are not checked.
 
     A PNG is 8 bytes and then chunks: a length, a name, that many bytes of data, and a checksum (PNG specification, 5.3).
     """

@@ -36,9 +36,9 @@ class Splats:
     - received (N, 3): the irradiance, divided by the irradiance without occlusion. It includes light that the object reflects to itself.
     - indirect (N, K', 3): spherical harmonics of the linear radiance that other parts of the object reflect to the splat. Without
       inter-reflection, K' is 0 and `received` is 1.
-    - doubt (N,) in 0..1: how little photos tell whether the splat is metal or paint; None where that is not known
+    - doubt (N,) in 0..1: 0 if photos tell whether the splat is metal or paint, 1 if they do not; None if unknown
     - constants: material values that are the same for all splats, by name (see CONSTANTS). Files store them in the header.
-    - others: what a PLY file has besides these properties. `write_splats` writes it again.
+    - others: further elements and properties of the PLY file that was read. `write_splats` writes them again.
     """
 
     positions: np.ndarray

@@ -2,8 +2,8 @@
 
 A pose is six numbers (6,): a rotation vector around the scene's centre, in radians, and a translation in scene radii. It moves the scene,
 not the camera. The pose zero is the identity. If the scene moves a little, each pixel moves with the surface that it shows, by an amount
-that follows from its depth (Baker and Matthews 2004, Engel et al. 2018). Colours are assumed to move with the surface. This is not quite
-true of mirror images, but on a curved surface they mostly do.
+that follows from its depth (Baker and Matthews 2004, Engel et al. 2018). Colours are assumed to move with the surface. Mirror images move
+differently, but only a little on a curved surface.
 """
 
 from collections.abc import Callable
@@ -39,9 +39,9 @@ def pose_step(
 ) -> Tensor:
     """Compute the pose (6,) that moves the rendering of `camera` towards the photo (H, W, 3), sRGB-encoded. Zero if nothing is shown.
 
-    It minimises Σ w |photo − picture + ∇picture · motion(pose)|² over the pixels and channels. ∇ takes central differences. It is the mean
-    of the picture's and the photo's gradients, which converges faster (Benhimane and Malis 2004). The weight w is small where the two
-    differ much.
+    The pose minimises Σ w |photo − picture + ∇ · motion(pose)|² over the pixels and channels, where picture is the rendering. ∇ is the mean
+    of the gradients of picture and photo, by central differences. This mean converges faster than one gradient (Benhimane and Malis 2004).
+    The weight w is small where picture and photo differ much.
     """
     maps = [rendering.color.clamp(0, 1), photo, rendering.blended_depth[..., None], rendering.alpha[..., None]]
     color, photo, depths, alpha = (_reduced(value, reduction) for value in maps)

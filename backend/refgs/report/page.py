@@ -3,10 +3,11 @@
 It reads these files of a run folder. If a file is missing, its section is left out:
 
     metrics.json     nested objects. Their numbers are metrics: those that `refgs.report.figures` names,
-                     relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}, and any others. Text: ambiguities.NAME.what, doubt.what.
+                     relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}, and any others.
+                     Texts are ambiguities.NAME.what and doubt.what.
     history.jsonl    one object a line: seconds, iteration, parts (seconds by kind of work), and the errors that `refgs.report.curves` names
     needs.json       optional features that were kept or left out: a list of {"what", "why"}, with "saved", "cost", "needed" if known, and
-                     "pictures" of both answers in needs/
+                     "pictures" with and without the feature, in needs/
     run.toml         the settings, and the capture's folder
     pictures/test/{photo,color,normal,albedo,roughness,metallic}/VIEW.png, and doubt/VIEW.png, true_normal/VIEW.png … if known
     pictures/relight/{truth,refgs,splats,mesh}/HDRI_VIEW.png
@@ -182,7 +183,7 @@ def _needs(file: Path) -> Needs:
 
 
 def _decisions(folder: Path, rows: list[Row]) -> list[dict]:
-    """Read the pictures of needs.json's decisions as data URLs, with a line of figures for each decision. Skip rows without pictures."""
+    """Make a dict of each row of needs.json: its decision, a line with PSNRs, and pictures as data URLs. Skip rows without pictures."""
     found = []
     for row in rows:
         if (shown := row.pictures) is None:

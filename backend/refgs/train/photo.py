@@ -57,7 +57,7 @@ class Photo(NamedTuple):
 
     @property
     def clipped(self) -> Tensor:
-        """Return where each channel (H, W, 3) is clipped, or nearly so: JPEG does not keep the largest code exactly."""
+        """Tell which channels of the pixels are clipped, bool (H, W, 3). JPEG changes codes a little, so nearly clipped ones count, too."""
         return self.image.float() >= torch.iinfo(self.image.dtype).max // 255 * 254
 
 

@@ -19,8 +19,8 @@ def start_parameters(
 ) -> tuple[Parameters, int, str]:
     """Make the initial parameters of the surfels, which start at the `first_points`.
 
-    Returns the parameters, the number of surfels on the visual hull, and a message for the user that says where the surfels start. Those on
-    the hull come first. If there is no hull, their number has no meaning.
+    Returns the parameters, the number of surfels on the visual hull, and a message for the user that says where the surfels start. Surfels
+    on the hull come first. Without a hull, the number is that of all surfels.
     """
     points = first_points(capture, views, settings.surfels, settings.train.seed, hollows)
     shown = len(points.positions) if points.on_hull is None else points.on_hull

@@ -79,11 +79,11 @@ class State:
         self.parts: dict[type, Any] = {}
 
     def part(self, kind: type[P]) -> P:
-        """Return the training's `Part` object of the class `kind`. It remembers what this part has found (see `train/part.py`)."""
+        """Return the `Part` object of the class `kind`: the memory of one part of the training (see `train/part.py`)."""
         return self.parts[kind]
 
     def needed(self, name: str) -> bool:
-        """Tell whether the scene needs an optional part of the training, as far as this is decided (see `train/decide`)."""
+        """Tell whether the scene needs an optional part of the training. True until that is decided (see `train/decide`)."""
         return name not in self.needs or self.needs[name].needed
 
     @property
@@ -161,7 +161,7 @@ class State:
         return self.picture(inputs if surfels is None else inputs._replace(surfels=surfels), camera)
 
     def photo(self, view: int, whole: bool = False) -> Photo:
-        """Return the crop of a view's photo that the training uses, or the whole photo if `whole` is true. It is in full size."""
+        """Return a view's photo in full size, cropped to what the training uses, or the whole photo if `whole` is true."""
         photo = self.photos[view]
         return photo if whole or self.crops is None else photo.part(*self.crops[view])
 

@@ -14,10 +14,10 @@ LEAST_GROWTH = 2  # even the smallest object may get this many times the surfels
 
 
 class ObjectSize(NamedTuple):
-    """Hold the object's size in the full photos, in pixels: medians over views. Both are 0 if photos without masks leave it unknown.
+    """Hold the object's size in the full photos, in pixels: medians over views. `span` and `area` are 0 if a photo has no mask.
 
-    `span` is the longer side of a mask's bounds, and `area` is the number of pixels in the mask. With a region to train, neither is larger
-    than that of the ball around the region.
+    `span` is the longer side of a mask's bounds, and `area` is the number of pixels in the mask. If the user set a region to train, the
+    ball around the region limits both.
     """
 
     span: float

@@ -1,6 +1,6 @@
-"""Train on reduced photos first: an iteration's time grows with the number of pixels, and early iterations need no fine ones.
+"""Train on reduced photos first. An iteration's time grows with the number of pixels, and early iterations need no fine details.
 
-Small objects are trained on full photos from the start: for an object that spans 64 pixels, photos of half the size lose 0.3 dB.
+Small objects are trained on full photos from the start: if an object spans only 64 pixels, photos of half the size lose 0.3 dB.
 """
 
 from collections.abc import Mapping
@@ -19,9 +19,9 @@ LEAST_SPAN = 200  # pixels that the object must span in reduced photos
 
 
 class Coarse(Part):
-    """Remember the training's stages, each with its own size of photos, and the reduced photos of the present stage.
+    """Remember the training's stages, and the reduced photos of the present stage. Each stage has its own size of photos.
 
-    The sides of `photos` are reduced by `factor`, which is 1 for full photos. `crops` are the parts of `photos` that are trained on.
+    The sides of `photos` are divided by `factor`, which is 1 for full photos. `crops` are the parts of `photos` that are trained on.
     """
 
     name, saved = "coarse", ("factor",)
@@ -37,14 +37,14 @@ class Coarse(Part):
 
 
 def stages(pixels: float) -> tuple[Stage, ...]:
-    """Plan the stages of a training whose object spans so many `pixels` in the full photos."""
+    """Plan the stages of a training whose object has a span of `pixels` in the full photos."""
     return *(Stage(*stage) for stage in PHOTO_STAGES if pixels / stage[1] >= LEAST_SPAN), *FULL
 
 
 def begin(state: State, pixels: float, refined: bool) -> None:
-    """Choose the stages of a training whose object spans so many `pixels` in the full photos, and start with the first one.
+    """Choose the stages of a training whose object has a span of `pixels` in the full photos, and start with the first one.
 
-    If poses are `refined`, full photos are used from the time on at which poses are judged.
+    If poses are `refined`, photos are full from POSES_KNOWN on: the progress at which poses are judged.
     """
     if state.settings.image.coarse == "off":
         return
@@ -103,7 +103,7 @@ def move_camera(state: State, view: int, camera: Camera) -> None:
 
 
 def cost(state: State, first: int, last: int) -> float:
-    """Estimate how long the iterations from `first` to `last` take together, in iterations on full photos."""
+    """Estimate the time of the iterations from `first` to `last`. The unit is the time of one iteration on full photos."""
     stages = state.part(Coarse).stages
     begun, ended = (iterations_time(1.0, k / state.total, stages) for k in (first, last))
     return state.total * (ended - begun)

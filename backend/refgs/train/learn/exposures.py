@@ -17,7 +17,7 @@ BALANCED = 0.1  # largest difference of a channel's logarithm that may still be 
 
 
 class Exposures(Part):
-    """Hold EXPOSURE on the training's device."""
+    """Hold EXPOSURE as a tensor on the training's device."""
 
     name = "exposures"
 

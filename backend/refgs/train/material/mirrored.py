@@ -1,8 +1,8 @@
 """Compare what photos show of each surfel with what it would show as a metal, and as paint, under the light learned so far.
 
-A metal shows what it mirrors, times its reflectance. Paint shows its diffuse radiance, the same in all photos, and a twenty-fifth of what
-it mirrors. Both are fitted to some photos by least squares. A surfel mirrors the light or, where its mirror ray meets the object, the mean
-radiance that photos show there. So no material has to be known.
+A metal shows what it mirrors, times its reflectance. Paint shows its diffuse radiance, the same in all photos, and about 4 % of what it
+mirrors. Both are fitted to some photos by least squares. A surfel mirrors the light or, where its mirror ray meets the object, the mean
+radiance that photos show there. So the material of the mirrored surface need not be known.
 """
 
 from collections.abc import Iterable, Iterator
@@ -33,8 +33,8 @@ class Fit(NamedTuple):
 
     - `ratio` (N,): the squared error as a metal, divided by that as paint
     - `slope` (N,): how much the radiance changes with what is mirrored, from photo to photo
-    - `reflectance` (N, 3), `roughness` (N,): those of the metal that fits best
-    - `seen` (N,): whether photos show enough of it
+    - `reflectance` (N, 3), `roughness` (N,): values of the metal that fits best
+    - `seen` (N,): whether photos show the surfel and its neighbours in enough pixels
     """
 
     ratio: Tensor
@@ -46,9 +46,9 @@ class Fit(NamedTuple):
 
 @torch.no_grad()
 def fit_both(state: State) -> tuple[Surfels, Seen, Fit]:
-    """Look at the surfels in some training photos, and fit both materials to them. Also returns the surfels, on the CPU.
+    """Observe the surfels in some training photos, and fit both materials to them. Returns surfels, observations and fit, on the CPU.
 
-    The state must have a light. What surfels mirror of the object is known only if the state has a mesh (`occluder`).
+    The state must have a light. Without a mesh (`state.occluder`), surfels are taken to mirror the light alone, and not the object.
     """
     photos = probe.spread_views(state, OBSERVED_VIEWS)
     inputs = state.inputs()
@@ -89,10 +89,10 @@ def _at_vertices(surfels: Surfels, seen: Seen, mesh: Mesh) -> Tensor:
 
 
 def _fit(seen: Seen, mirrored: Iterable[list[Tensor]], positions: Tensor) -> Fit:
-    """Fit both materials to all photos, for each of ROUGHNESSES, and keep the best of each kind.
+    """Fit both materials to all photos, for each of ROUGHNESSES. Keep the best metal and the best paint.
 
     Let R be what a surfel mirrors. A metal of reflectance s shows (s FG0 + FG1) R. Paint of diffuse radiance c shows c + F R. FG0, FG1 and
-    F are the entries 0, 1 and 3 of `brdf.reflectance_table`. Sums over photos suffice to fit both.
+    F are the entries 0, 1 and 3 of `brdf.reflectance_table`. Both fits need only sums over the photos.
     """
     near, count = neighbours(positions, NEIGHBOURS), len(positions)
     names, shape = ("rest", "both", "power", "paint", "first"), (len(ROUGHNESSES), count, 3)

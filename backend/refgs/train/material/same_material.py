@@ -51,10 +51,10 @@ class Found(NamedTuple):
 
 
 def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
-    """Decide which surfels are taken for the wrong kind, by what photos tell (see `material.mirrored`) and by their neighbours.
+    """Find surfels whose kind, metal or paint, is wrong, by what photos tell of them and their neighbours (see `material.mirrored`).
 
-    Evidence for either kind spreads over a surface. Where there is none, surfels keep the kind that training has found so far. That kind
-    does not spread.
+    Evidence for either kind spreads over a surface. Where no evidence arrives, surfels keep the kind that training has found so far. That
+    kind never spreads to neighbours of the other kind.
     """
     graph, part, metal, paint = _evidence(surfels, seen, fit)
     was, none = (surfels.metallic > 0.5).numpy(), 1e-4
@@ -75,20 +75,20 @@ def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
 
 
 def doubt(surfels: Surfels, seen: Seen, fit: Fit) -> Tensor:
-    """Measure where photos do not tell metal from paint, whatever the training has decided: (N,) in 0..1.
+    """Measure how little photos tell metal from paint, for each surfel: (N,) in 0..1. What the training has decided has no influence.
 
-    Doubt is 0 where photos tell. It is 1 where hardly any pixel shows the surfel, or where photos tell nothing about its piece. Between
-    them, it rises with the distance from surfels of the same piece about which photos tell.
+    Doubt is 0 where photos tell. It is 1 where hardly any pixel shows the surfel, or where photos tell nothing about its piece. Elsewhere
+    it rises with the distance from surfels of the same piece about which photos tell.
 
     Let p be the probability of metal. Doubt is 1 − |2 p − 1|. The value 2 p − 1 solves the system of `decide`, with metals at 1 and paint
-    at −1. All surfels are drawn to 0 with the weight OPEN, instead of to their kind so far.
+    at −1. The weight OPEN draws all surfels to 0, whereas `decide` draws them to the kind that training has found so far.
     """
     graph, _, metal, paint = _evidence(surfels, seen, fit)
     return 1 - torch.from_numpy(_solve(graph, metal + paint + OPEN, metal - paint)).float().abs().clamp_max(1)
 
 
 def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the graph of surfels (N, N), which of them take part (N,), and the evidence for metal (N,) and for paint (N,)."""
+    """Return the graph's Laplacian (N, N), whether each surfel has enough pixels (N,), and the evidence for metal (N,) and paint (N,)."""
     graph, part = _laplacian(surfels.positions, seen), (seen.pixels > FRINGE).double().numpy()
     ratio = np.asarray((fit.ratio.clamp(1e-3, 1e3).log().double() * fit.seen).numpy())
     mirrors = (fit.slope > SLOPE) & (fit.reflectance.amax(dim=1) > REFLECTANCE)
