@@ -1,6 +1,7 @@
 """Read the table that a batch writes, with a row for each run, and hold it for the panel."""
 
 import math
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,8 +27,8 @@ _shown: tuple[Path, object] | None = None
 class Row(NamedTuple):
     """Hold a batch's row on one run. `state` is "waiting", "running", "done", "failed" or "stopped".
 
-    `words` says how far the run is, or which figures it reached. `what` says which step failed and why. `log` and `picture` are paths, ""
-    if there is none.
+    `words` says how far the run is, or which figures it reached. `what` says which step failed and why. `log` and `picture` are paths of
+    files in the batch's folder, "" if there is none.
     """
 
     name: str
@@ -53,11 +54,22 @@ def read_rows(folder: Path) -> list[Row]:
             name, state, what = (str(facts[key]) for key in ("name", "state", "what"))
             if state in ("waiting", "running") and not going:
                 state = "stopped"
-            files = (str(facts[key] or "") for key in ("log", "picture"))
+            files = (
+                _inside(folder, str(facts[key] or ""), kind) for key, kind in (("log", ".log"), ("picture", ".png"))
+            )
             rows.append(Row(name, state, _words(state, facts), what, *files))
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
             continue
     return rows
+
+
+def _inside(folder: Path, path: str, suffix: str) -> str:
+    """Return a path that a table names, or "" if it is not a file with this suffix in the batch's folder.
+
+    The panel opens the file with the program that the system has for it. Of a program, that would run it.
+    """
+    inside = os.path.realpath(path).startswith(os.path.realpath(folder) + os.sep)
+    return path if inside and path.endswith(suffix) and os.path.isfile(path) else ""
 
 
 def _words(state: str, facts: dict) -> str:

@@ -1,5 +1,7 @@
 """Import a run folder, the result of a training: its splats, mesh and cameras, and the light recovered from the photos."""
 
+import json
+import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -142,6 +144,7 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
 
     Vertices that the file doubles at the seams of the textures are merged, so that the mesh is closed.
     """
+    _check_self_contained(path)
     before = set(bpy.data.objects)
     try:
         bpy.ops.import_scene.gltf(filepath=str(path), merge_vertices=True)
@@ -165,6 +168,30 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
     if not meshes:
         raise InputError(f"{path} contains no mesh: export the run again")
     return meshes
+
+
+def _check_self_contained(path: Path) -> None:
+    """Raise InputError if a GLB names other files: Blender's importer would read any file of the computer that a run names.
+
+    A GLB has a header of 12 bytes, then the length and the kind of a JSON chunk, then the chunk (glTF 2.0 specification).
+    """
+    try:
+        with open(path, "rb") as file:
+            length, kind = struct.unpack("<12xI4s", file.read(20))
+            tree = json.loads(file.read(length)) if kind == b"JSON" else {}
+        inside = not any("uri" in entry for kind in ("buffers", "images") for entry in tree.get(kind, ()))
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from None
+    except (
+        struct.error,
+        ValueError,
+        AttributeError,
+        TypeError,
+        RecursionError,
+    ):  # Blender's importer says what is wrong
+        return
+    if not inside:
+        raise InputError(f"{path} names other files, which runs never do: export the run again")
 
 
 def _doubt_words(folder: Path) -> str:

@@ -167,7 +167,8 @@ def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, folder: 
     row = batch_table.chosen_row(folder)
     if row is not None and row.what:
         wrapped_text(layout, f"{row.name}: {row.what}", width, "ERROR")
-        layout.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = row.log
+        if row.log:
+            layout.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = row.log
     elif row is not None and row.state == "done":
         layout.operator(ImportTrained.bl_idname, text=f"Import {row.name}", icon="IMPORT").folder = str(
             folder / row.name

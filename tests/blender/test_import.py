@@ -27,6 +27,7 @@ from refgs_addon.scene.run_parts import cameras, parts, show
 from refgs_addon.scene.run_toml import newer_release
 from refgs_addon.scene.splat_cloud import MATERIALS, normal_slopes, read_splats
 from tests.makers.blender import attribute, evaluated_mesh
+from tests.makers.box import rewrite_glb
 from tests.makers.distances import spread
 from tests.makers.runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_columns, write_ply
 
@@ -410,6 +411,10 @@ def changed_camera(**values):
     return lambda path: path.write_text(json.dumps({"frames": [FRAMES[0] | values]}))
 
 
+def names_another_file(path):
+    rewrite_glb(path, lambda tree: tree["buffers"].__setitem__(0, {"uri": "/etc/passwd", "byteLength": 64}))
+
+
 @pytest.mark.parametrize(
     ("name", "spoil", "says"),
     [
@@ -433,6 +438,7 @@ def changed_camera(**values):
         ("cameras.json", changed_camera(cx=10**400), "not the cameras.json"),
         ("environment.exr", not_json, "not a complete EXR"),
         ("mesh.glb", cut, "glTF"),
+        ("mesh.glb", names_another_file, "names other files"),
     ],
 )
 def test_a_broken_folder_leaves_nothing_behind(run_folder, scene, name, spoil, says):

@@ -57,6 +57,18 @@ def test_what_a_killed_batch_left_is_stopped(results):
     assert [row.state for row in batch_table.read_rows(results)] == ["done", "failed", "stopped", "stopped"]
 
 
+def test_a_table_opens_only_logs_of_its_own_folder(tmp_path):
+    inside, program, outside = (tmp_path / name for name in ("runs/logs/cup/train.log", "runs/a.bat", "b.log"))
+    for file in (inside, program, outside):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("text")
+    (tmp_path / "runs" / "link.log").symlink_to(outside)
+    links = tmp_path / "runs" / "link.log", tmp_path / "runs" / "logs" / ".." / ".." / "b.log"
+    logs = [inside, program, outside, *links, tmp_path / "runs" / "none.log"]
+    write_table(tmp_path / "runs", *(row(f"run {n}", "failed", log=str(log)) for n, log in enumerate(logs)))
+    assert [row.log for row in batch_table.read_rows(tmp_path / "runs")] == [str(inside), "", "", "", "", ""]
+
+
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", '{"rows": 3}', '{"rows": [3, {"name": "a"}, {"name": "b", "state": null}]}']
 )

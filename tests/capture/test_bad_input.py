@@ -1,6 +1,7 @@
 """Test that broken captures are refused with one line that names the file or frame at fault."""
 
 import json
+import os
 import pickle
 from pathlib import Path
 
@@ -189,6 +190,16 @@ def test_colmap_files_cut_short(tmp_path, name, binary, kept):
     header = 0 if binary else data.index(b"\n", data.rfind(b"# ")) + 1
     file.write_bytes(data[: max(int(kept * len(data)), header)])
     refused(lambda: read_capture(tmp_path), file.name, "truncated")
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("binary", [True, False])
+def test_colmap_files_with_gigabytes_of_zeros(tmp_path, name, binary):
+    """Check files that take no room on the disk: 30 GB of zeros, in a file that says that it has 2⁶⁰ entries."""
+    file = colmap(tmp_path, binary) / "sparse" / "0" / f"{name}.{'bin' if binary else 'txt'}"
+    file.write_bytes((1 << 60).to_bytes(8, "little") if binary else b"# a comment\n")
+    os.truncate(file, 30 << 30)
+    refused(lambda: read_capture(tmp_path), file.name, "truncated or not COLMAP's")
 
 
 @pytest.mark.parametrize("binary", [True, False])

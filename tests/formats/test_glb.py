@@ -8,10 +8,11 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from refgs.color import srgb_encode
+from refgs.errors import InputError
 from refgs.formats.exr import read_exr
-from refgs.formats.gltf import write_glb
+from refgs.formats.gltf import read_glb, write_glb
 from refgs.formats.tangents import vertex_tangents
-from tests.makers.box import glb_chunks, textured_box
+from tests.makers.box import glb_chunks, rewrite_glb, textured_box
 
 
 @pytest.fixture(scope="module")
@@ -107,3 +108,22 @@ def test_blender_imports_it_upright_with_the_right_material(written):
         assert distance < 1e-4
         assert np.dot(loop.tangent, tangents[index] @ turn) > 0.999
         assert loop.bitangent_sign == signs[index]
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda tree: tree["buffers"].__setitem__(0, {"uri": "/dev/zero", "byteLength": 64}),
+        lambda tree: tree["images"].append({"uri": "../secret.png"}),
+        lambda tree: tree["accessors"][0].update(count=10**12),
+        lambda tree: tree.update(accessors=[{"componentType": 5126, "type": "VEC3", "count": 10**10}]),
+    ],
+)
+def test_a_file_that_reaches_beyond_itself_is_refused(tmp_path, edit):
+    """Check that no other file is read, and no memory taken, for a mesh of a run that somebody else made."""
+    mesh, textures = textured_box()
+    write_glb(tmp_path / "mesh.glb", mesh, textures)
+    assert len(read_glb(tmp_path / "mesh.glb").faces) == len(mesh.faces)
+    rewrite_glb(tmp_path / "mesh.glb", edit)
+    with pytest.raises(InputError, match="is not a whole binary glTF file of a mesh"):
+        read_glb(tmp_path / "mesh.glb")

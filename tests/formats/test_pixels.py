@@ -97,3 +97,33 @@ def test_a_chunk_that_is_longer_than_its_file_takes_no_memory(tmp_path):
     with pytest.raises(InputError, match=r"a\.png: the image is truncated or broken"):
         read_codes(file)
     assert fuzz.memory("VmHWM") - before < 100 << 20
+
+
+def test_a_photo_of_little_that_takes_gigabytes_is_refused(tmp_path):
+    """Check a PNG of one colour: as a photo it is refused, and as a grey mask, which is one, it is read."""
+    Image.new("RGB", (10_500, 10_500)).save(tmp_path / "photo.png")
+    assert read_header(tmp_path / "photo.png")[:2] == (10_500, 10_500)
+    with pytest.raises(InputError, match="do not fit into so small a file"):
+        read_codes(tmp_path / "photo.png")
+
+
+def test_a_jpeg_of_a_thousand_scans_is_refused(tmp_path):
+    """Check a progressive JPEG whose last scan is repeated: every decoder takes the time of a picture for each."""
+    path = tmp_path / "a.jpg"
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)).save(path, progressive=True)
+    data = path.read_bytes()
+    scan = data[data.rindex(b"\xff\xda") : data.rindex(b"\xff\xd9")]
+    assert read_image(path)[0].shape == (64, 64, 3)
+    path.write_bytes(data[:-2] + 1000 * scan + data[-2:])
+    with pytest.raises(InputError, match="more than 100 scans"):
+        read_image(path)
+
+
+def test_a_panorama_is_no_larger_than_its_pixels(tmp_path):
+    path = tmp_path / "light.hdr"
+    path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 4\n" + bytes(32))
+    assert read_environment(path).shape == (2, 4, 3)
+    with open(path, "r+b") as file:
+        file.truncate(30 << 30)  # without taking room on the disk
+    with pytest.raises(InputError, match="larger than its picture"):
+        read_environment(path)

@@ -30,3 +30,14 @@ def glb_chunks(file):
     data = file.read_bytes()
     length = int.from_bytes(data[12:16], "little")
     return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+def rewrite_glb(file, edit):
+    """Call `edit` on the JSON of a binary glTF file, as a mapping, and write the file again."""
+    tree, buffer = glb_chunks(file)
+    edit(tree)
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = [len(text).to_bytes(4, "little"), b"JSON", text, len(buffer).to_bytes(4, "little"), b"BIN\0", buffer]
+    size = 12 + sum(map(len, chunks))
+    file.write_bytes(b"".join([b"glTF", (2).to_bytes(4, "little"), size.to_bytes(4, "little"), *chunks]))

@@ -21,7 +21,7 @@ from refgs.capture.reduce import encode, reduced
 from refgs.capture.types import View
 from refgs.errors import InputError, reason
 from refgs.formats.exr import read_exr, read_exr_header
-from refgs.formats.pixels import check_chunks, check_pixels
+from refgs.formats.pixels import check_chunks, check_photo, check_pixels
 from refgs.memory import is_shortage
 
 register_heif_opener()  # Pillow opens HEIC then
@@ -148,6 +148,7 @@ def read_codes(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | No
     if _is_exr(path):
         return *_exr_codes(path), EXR_WHITE
     with _open(path) as picture:
+        check_photo(path, *picture.size)
         turns = _turns(picture)
         pixels = _decode_16_bit(picture, path)
         white = 255 if pixels is None else 65535

@@ -4,6 +4,7 @@ COLMAP's own reader is not used. For a truncated file it prints an unrelated mes
 errors that name the file.
 """
 
+import mmap
 import re
 import struct
 from collections.abc import Callable
@@ -31,6 +32,8 @@ MODELS = {
     9: ("RADIAL_FISHEYE", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
 }
+LONGEST_NAME = 4096  # bytes of a photo's path
+LARGEST_TEXT = 2 << 30  # bytes of a text file; a model of 1,000 photos has 200 MB
 SUPPORTED = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
@@ -92,7 +95,8 @@ class _Reader:
     """Read values from a binary file one after the other. Raises struct.error or ValueError if the file is truncated."""
 
     def __init__(self, file: Path):
-        self.data, self.at = file.read_bytes(), 0
+        with file.open("rb") as opened:  # mapped, not read: models of thousands of photos take gigabytes
+            self.data, self.at = mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ), 0
 
     def take(self, layout: str) -> tuple:
         layout = "<" + layout
@@ -101,7 +105,9 @@ class _Reader:
         return values
 
     def name(self) -> str:
-        end = self.data.index(b"\0", self.at)
+        end = self.data.find(b"\0", self.at, self.at + LONGEST_NAME)
+        if end < 0:
+            raise ValueError("truncated")
         text = self.data[self.at : end].decode("utf-8")
         self.at = end + 1
         return text
@@ -118,6 +124,8 @@ def _binary_cameras(file: Path) -> dict[int, Intrinsics]:
         number, model, width, height = source.take("iiQQ")
         if model not in MODELS:
             raise InputError(f"{file}: camera model number {model} is not supported, only {', '.join(SUPPORTED)}.")
+        if number in cameras:
+            raise ValueError("not COLMAP's")
         name, count = MODELS[model]
         cameras[number] = Intrinsics(name, width, height, source.take(f"{count}d"))
     return cameras
@@ -127,15 +135,21 @@ def _binary_images(file: Path) -> list[Image]:
     source, images = _Reader(file), []
     for _ in range(source.take("Q")[0]):
         _, *pose, camera_id = source.take("I7di")
+        if not any(pose[:4]):  # no rotation: a file of zeros has billions of these
+            raise ValueError("not COLMAP's")
         images.append(Image(source.name(), camera_id, tuple(pose)))
         source.skip(24 * source.take("Q")[0])  # keypoints: x, y, point id
     return images
 
 
 def _binary_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    source, rows = _Reader(file), []
+    source, rows, last = _Reader(file), [], None
     for _ in range(source.take("Q")[0]):
-        rows.append(source.take("Q3d3Bd")[1:7])
+        number, *row = source.take("Q3d3Bd")[:7]
+        if number == last:  # numbers are unique: a file of zeros has billions of these
+            raise ValueError("not COLMAP's")
+        last = number
+        rows.append(row)
         source.skip(8 * source.take("Q")[0])  # track: image id, keypoint
     return _points(rows)
 
@@ -151,6 +165,8 @@ def _entries(file: Path, lines_each: int = 1) -> list[str]:
 
     Raises ValueError if the file has fewer entries than its header says.
     """
+    if file.stat().st_size > LARGEST_TEXT:
+        raise ValueError("larger than such a file can be")
     lines = file.read_text(encoding="utf-8").splitlines()
     entries = [line for line in lines if not line.startswith("#") and (lines_each > 1 or line.strip())]
     while entries and not entries[-1].strip():  # the line of keypoints may be empty

@@ -1,6 +1,9 @@
 """Read and write textured meshes as binary glTF 2.0. Textures are also written beside the mesh."""
 
+import io
+import json
 import os
+import struct
 from pathlib import Path
 from typing import cast
 
@@ -14,7 +17,7 @@ from refgs.errors import InputError, reason
 from refgs.formats.mesh import Y_UP, Mesh, UnwrappedMesh, check_mesh
 from refgs.formats.tangents import vertex_tangents
 from refgs.formats.textures import FOLDER, Textures, write_textures
-from refgs.paths import whole
+from refgs.paths import read_bytes, whole
 
 SPECULAR = "KHR_materials_specular"
 
@@ -73,7 +76,9 @@ def write_glb(path: str | os.PathLike, mesh: UnwrappedMesh, textures: Textures) 
 def read_glb(path: str | os.PathLike) -> Mesh:
     """Read the vertices and faces of a file that `write_glb` wrote. They are turned back to Z up. Raises InputError for a broken file."""
     try:
-        model = trimesh.load_mesh(path, file_type="glb", process=False, skip_materials=True)
+        data = read_bytes(Path(path))
+        _check_self_contained(data)
+        model = trimesh.load_mesh(io.BytesIO(data), file_type="glb", process=False, skip_materials=True)
         vertices, faces = np.asarray(model.vertices, np.float64), np.asarray(model.faces)
     except Exception as error:  # trimesh raises errors of many types
         raise InputError(
@@ -82,3 +87,19 @@ def read_glb(path: str | os.PathLike) -> Mesh:
     mesh = Mesh(vertices @ Y_UP, faces)
     check_mesh(path, mesh)
     return mesh
+
+
+def _check_self_contained(data: bytes) -> None:
+    """Raise ValueError if a binary glTF file names other files, or declares more numbers than it has bytes.
+
+    Its numbers then could come from any file of the computer, or take any amount of memory. `data` is the file's content (glTF 2.0
+    specification, "GLB File Format": a header of 12 bytes, then the length and the kind of the JSON chunk).
+    """
+    length, kind = struct.unpack_from("<I4s", data, 12)
+    if kind != b"JSON":
+        raise ValueError("it does not begin with JSON")
+    tree = json.loads(data[20 : 20 + length])
+    if any("uri" in entry for kind in ("buffers", "images") for entry in tree.get(kind, ())):
+        raise ValueError("it names other files")
+    if any(entry["count"] > len(data) for entry in tree.get("accessors", ())):
+        raise ValueError("it has fewer numbers than it declares")

@@ -11,6 +11,8 @@ from refgs.errors import InputError, InputWarning
 from refgs.formats.exr import read_exr
 from refgs.formats.pixels import check_pixels
 
+HEADER = 1 << 16  # bytes in which the header of a Radiance picture ends
+
 
 def read_environment(path: str | os.PathLike) -> np.ndarray:
     """Read a panorama of linear radiance, EXR or Radiance (.hdr), as float32 (H, W, 3). Raises InputError if the file is no panorama.
@@ -38,9 +40,13 @@ def _read_radiance(path: Path) -> np.ndarray:
         raise InputError(f"{path} is missing")
     try:
         with path.open("rb") as file:  # the size is in the header's last line
-            if size := re.search(rb"\n[-+]Y +(\d{1,9}) +[-+]X +(\d{1,9})\n", file.read(1 << 16)):
+            if size := re.search(rb"\n[-+]Y +(\d{1,9}) +[-+]X +(\d{1,9})\n", file.read(HEADER)):
                 check_pixels(path, int(size[2]), int(size[1]))
-        pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+                if path.stat().st_size > HEADER + 8 * int(size[1]) * int(
+                    size[2]
+                ):  # a pixel has 4 bytes, or 8 packed badly
+                    raise InputError(f"{path}: the file is larger than its picture. Download it again.")
+        pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if size else None
     except (cv2.error, OSError):  # an empty file; a disk that fails
         pixels = None
     if pixels is None or pixels.dtype != np.float32:

@@ -8,6 +8,8 @@ MOST = 256_000_000  # pixels; cameras take up to 200 million, or 240 by shifting
 # A larger picture in a file so small that this many pixels share a byte is taken for a broken one. A PNG of one colour has 1032 to 8256, by
 # deflate's limit, and a JPEG at most 341.
 SMALL, MOST_PER_BYTE = 100_000_000, 10_000
+PHOTO_PER_BYTE = 50  # the same for photos, which are not of one colour as masks are; those of phones have at most 10
+MOST_SCANS = 100  # of a JPEG; progressive ones have about ten. Each is decoded in the time of a whole picture
 
 
 def check_pixels(path: Path, width: int, height: int, small: int = SMALL, per_byte: int = MOST_PER_BYTE) -> None:
@@ -20,6 +22,21 @@ def check_pixels(path: Path, width: int, height: int, small: int = SMALL, per_by
         raise InputError(f"{size} are more than the {MOST // 1_000_000} million that are read. Save it smaller.")
     if width * height > max(small, per_byte * path.stat().st_size):
         raise InputError(f"{size} do not fit into so small a file: it is broken. Replace it, or save it as PNG.")
+
+
+def check_photo(path: Path, width: int, height: int) -> None:
+    """Raise InputError if a file would take far more memory or time to decode than any photo of its size.
+
+    Masks are not checked by this function, because they may be of one colour.
+    """
+    check_pixels(path, width, height, per_byte=PHOTO_PER_BYTE)
+    with open(path, "rb") as file:
+        if (
+            file.read(2) == b"\xff\xd8" and file.read().count(b"\xff\xda") > MOST_SCANS
+        ):  # start of scan (ITU-T T.81, B.1.1.3)
+            raise InputError(
+                f"{path}: this JPEG has more than {MOST_SCANS} scans, which takes too long to read. Save it anew."
+            )
 
 
 def check_chunks(path: Path) -> None:
