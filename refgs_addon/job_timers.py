@@ -53,7 +53,7 @@ def _poll_other_processes() -> float | None:
 
 
 def follow_batch(folder: Path) -> None:
-    """Start a timer that reads the table of the batch in a folder, and again every two seconds until the batch ends."""
+    """Start a timer that reads the table of the batch in a folder, at once and then every two seconds until the batch ends."""
     global _batch
     _batch = folder
     if not bpy.app.timers.is_registered(_poll_batch):

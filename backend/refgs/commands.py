@@ -105,8 +105,8 @@ def poses(folder: Path, once: bool = False) -> None:
 def masks(folder: Path, changes: list[str], model: Path | None = None, once: bool = False) -> None:
     """Make masks of a capture's photos, and write them to its folder `masks`.
 
-    `changes` set the box about the object. `model` is an ONNX file that judges pixels in place of their colours. With `once`, a capture in
-    which some photos have masks is left as it is, as by a training.
+    `changes` set the box around the object. `model` is an ONNX file that finds the object's pixels; without it, colours are used. With
+    `once`, nothing is done if any photo has a mask already.
     """
     from refgs.capture import read_capture
     from refgs.capture.masks import make_masks
@@ -125,10 +125,11 @@ def masks(folder: Path, changes: list[str], model: Path | None = None, once: boo
 def train(asked: Asked, once: bool = False) -> None:
     """Train on a capture and write a run folder, or resume the training in it.
 
-    Ctrl-C ends the training with a checkpoint, from which it can be resumed. A second Ctrl-C ends it at once. SIGTERM ends it with a
-    checkpoint if that takes no longer than CHECKPOINT_BY; otherwise the last one counts.
+    Ctrl-C ends the training with a checkpoint, from which it can be resumed. A second Ctrl-C ends it at once. SIGTERM also ends it with a
+    checkpoint. If writing that takes longer than CHECKPOINT_BY seconds, the training ends without it and can be resumed from the checkpoint
+    before.
 
-    With `once`, the training is started, or resumed, or left as it is if it has ended. It must be asked for as it was before.
+    With `once`, a training that has ended is left as it is; any other is started or resumed. Its settings must be those of the first call.
     """
     if once:
         left = train_job.unfinished(asked)
@@ -161,9 +162,10 @@ def train(asked: Asked, once: bool = False) -> None:
 
 @contextmanager
 def _signals_to_stop(repeat: float | None = CHECKPOINT_BY, end: float = END_BY) -> Iterator[list[int]]:
-    """Collect the signals SIGINT and SIGTERM of a `with` block in a list, which is yielded. A second one ends the block at once.
+    """Collect the signals SIGINT and SIGTERM of a `with` block in a list, which is yielded. A second signal ends the block at once.
 
-    SIGTERM counts as a second one after `repeat` seconds, unless that is None. After `end` seconds the process ends, whatever it does.
+    If the first signal is SIGTERM, another SIGTERM is sent after `repeat` seconds, unless `repeat` is None. After `end` seconds, the
+    process exits, even if it is busy.
     """
     stopped, timers = [], []
 
@@ -192,7 +194,7 @@ def _signals_to_stop(repeat: float | None = CHECKPOINT_BY, end: float = END_BY) 
 
 
 def _end(signals: list[int]) -> None:
-    """End the process as the first of these signals does, or as Ctrl-C if there is none."""
+    """End the process: with the status TRY_AGAIN if the first signal was SIGTERM, else by raising KeyboardInterrupt, as Ctrl-C does."""
     if signals and signals[0] == signal.SIGTERM:
         sys.exit(TRY_AGAIN)
     raise KeyboardInterrupt

@@ -26,7 +26,7 @@ class InputError(Exception):
 
 
 class TryAgain(InputError):
-    """Error that is not the input's fault: a full disk, a card that fails, a run that another process works in.
+    """Error that is not the input's fault: a full disk, a card that fails, a run folder that another process is using.
 
     The same command may succeed later. The command line exits with the status TRY_AGAIN.
     """
@@ -41,5 +41,5 @@ class InputWarning(UserWarning):
 
 
 def reason(error: Exception) -> str:
-    """Return what another library's error says, short enough to be quoted in a message. Its type's name if it says nothing."""
+    """Return the message of another library's error, cut short for quoting. If it is empty, return the name of the error's type."""
     return " ".join(str(error).split())[:120] or type(error).__name__

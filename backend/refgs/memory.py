@@ -30,7 +30,7 @@ def is_shortage(error: BaseException) -> bool:
 
 @contextmanager
 def shortage_named(lower: str = LESS) -> Iterator[None]:
-    """Raise InputError if a `with` block runs out of main memory. `lower` says what needs less."""
+    """Raise InputError if a `with` block runs out of main memory. `lower` is the advice that ends the message."""
     try:
         yield
     except Exception as error:

@@ -25,7 +25,7 @@ class _Section(BaseModel):
 class RegionSettings(_Section):
     """Wanted part of a capture, as a box, and its up direction.
 
-    Both are in the frame of the cameras.json of a run without them (docs/run-folder.md).
+    Both are in the frame of the cameras.json that a run without a region would write (docs/run-folder.md).
     """
 
     centre: Vector = Field(description="centre of the box")
@@ -150,7 +150,7 @@ class InitialSettings(_Section):
 
 
 class IndirectSettings(_Section):
-    """Inter-reflection: the object's reflection in itself, by rays against a mesh."""
+    """Inter-reflection: the object's reflection in itself. Mirror rays are traced against a mesh."""
 
     start: float = Field(ge=0, le=1, description="start, a part of the training; 1: never")
     every: int = Field(ge=1, description="iterations between meshes")
@@ -161,7 +161,7 @@ class IndirectSettings(_Section):
 
 
 class ResidualSettings(_Section):
-    """Colour by direction that adds what material and light do not explain, sRGB-encoded. Dropped under another light."""
+    """Residual: a view-dependent colour, sRGB-encoded, that adds what material and light do not explain. Left out under another light."""
 
     start: float = Field(
         gt=0, le=1, description="start, a part of the training; material and light are frozen from then on. 1: never"
@@ -248,7 +248,7 @@ class DensifySettings(_Section):
 
 
 class PropagationSettings(_Section):
-    """Material-aware normal propagation (paper §3.3): surfels of shiny metal grow at intervals and pass their normals on."""
+    """Material-aware normal propagation (paper §3.3). At intervals, shiny metal surfels grow and so pass on their normals."""
 
     every: int = Field(ge=0, description="iterations between passes; 0: none")
     stop: float = Field(ge=0, le=1, description="end, a part of the training")
@@ -337,7 +337,7 @@ def preset_settings(preset: str, changes: Iterable[Assignment]) -> Settings:
 
 
 def parse_change(text: str) -> Assignment:
-    """Parse a change `section.key=value`. Some keys need no section (`SHORT`). Raises InputError if it is not written so."""
+    """Parse a change `section.key=value`. Some keys need no section (`SHORT`). Raises InputError if the text has another form."""
     key, equals, value = text.partition("=")
     key = SHORT.get(key.strip(), key.strip())
     section, dot, name = key.partition(".")

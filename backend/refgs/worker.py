@@ -79,7 +79,7 @@ class Train(_Command):
     hints: str | None = None
 
     def asked(self) -> Asked:
-        """Return what the command asks for. Raises InputError if its keys do not go together."""
+        """Return what the command asks for. Raises InputError if its options are wrong or do not fit together."""
         run, hints = (Path(path) if path else None for path in (self.run, self.hints))
         changes = tuple(self.settings)
         return Asked(
@@ -131,7 +131,7 @@ CLOSED = None  # queued in place of a command: the input has ended
 
 @dataclass
 class Refused:
-    """Line of the input that is no command. `job` is the job that it asks for, None if it asks for none. `what` says what is wrong."""
+    """Line of the input that is not a valid command. `job` is the name of the job that it asks for, or None. `what` says what is wrong."""
 
     job: str | None
     what: str
@@ -209,8 +209,8 @@ class Worker:
     def send(self, event: str, facts: dict[str, Any]) -> None:
         """Write an event to the output as a JSON line.
 
-        If writing fails because nobody reads the output any more, act as if the input had ended. After a `Keep` command with `on` = True,
-        ignore the failure instead, so that jobs continue. The message `what` is written as one line.
+        If nobody reads the output any more, writing fails. Then jobs are ended as when the input ends, unless a `Keep` command with `on` =
+        True has come. The message `what` is written as one line.
         """
         if "what" in facts:
             facts = facts | {"what": one_line(facts["what"])}
@@ -291,7 +291,10 @@ class Worker:
         return "done", facts | {"psnr": quality, "left_out": left_out}
 
     def _hear_training(self, event: str, facts: dict[str, Any]) -> None:
-        """Send an event of a training. While it makes masks, also handle commands: it has no iterations yet that could."""
+        """Send an event of a training. While the training makes masks, also handle commands.
+
+        `_attend` handles commands only later, before each iteration.
+        """
         self.send(event, facts)
         while event == "progress" and "stage" in facts and not self._commands.empty():
             command = self._commands.get()

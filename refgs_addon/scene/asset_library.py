@@ -34,8 +34,8 @@ def library_name(folder: Path) -> str:
 def import_as_assets(folder: Path) -> jobs.Job:
     """Start a job that makes each finished run of a batch an asset, and then lists the library in Blender's preferences.
 
-    Files that are in the library already stay as they are. Another Blender process does it, so that the open file stays as it is. Raises
-    InputError if there is no run to import, or if this is being done already.
+    Files that are in the library already are not written again. The job runs in another Blender process, so the open file does not change.
+    Raises InputError if there is no run to import, or if such a job for this batch is running already.
     """
     from .render_process import start_blender
 
@@ -96,7 +96,7 @@ def add_catalog(library: Path) -> None:
 
 
 def add_library(folder: Path) -> None:
-    """List the library of the batch in a folder among the asset libraries of Blender's preferences, unless it is there."""
+    """Add the library of the batch in a folder to the asset libraries of Blender's preferences, unless it is listed already."""
     preferences, path = bpy.context.preferences, (folder / LIBRARY).resolve()
     known = preferences.filepaths.asset_libraries
     if all(Path(bpy.path.abspath(library.path)).resolve() != path for library in known):

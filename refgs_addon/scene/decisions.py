@@ -13,10 +13,10 @@ ON_OFF = ("on", "off")  # words of the trainer's settings [needs]
 
 @dataclass(frozen=True)
 class Decision:
-    """Store a decision that the trainer wrote to a run's needs.json, docs/run-folder.md.
+    """Store a decision that the trainer wrote to a run's needs.json (see docs/run-folder.md).
 
-    `needed` is the answer. `pictures` maps "on", "off" and "photo" to files, all of the view `view`. `psnr` maps "on" and "off" to the PSNR
-    of the two pictures against the photo, in dB.
+    `need` names an optional part of the training, and `needed` says whether it was kept. `pictures` maps "on", "off" and "photo" to files,
+    all of the view `view`. `psnr` maps "on" and "off" to the PSNR of the two pictures against the photo, in dB.
     """
 
     need: str
@@ -40,7 +40,7 @@ _read: dict[Path, tuple[int, list[Decision]]] = {}  # by needs.json: when it was
 
 
 def decisions(folder: Path) -> list[Decision]:
-    """List the decisions of a run that have pictures, also while it is trained. A file that is absent or broken has none."""
+    """List the decisions of a run that have pictures, also during its training. Return [] if needs.json is absent or broken."""
     file = folder / "needs.json"
     try:
         written = file.stat().st_mtime_ns
@@ -74,7 +74,7 @@ def _parse(folder: Path, file: Path) -> list[Decision]:
 
 
 def find_decision(folder: Path, need: str) -> Decision:
-    """Find a run's decision about a need. Raises InputError if it has none with pictures."""
+    """Find a run's decision about a need. Raises InputError if the run has no such decision with pictures."""
     for decision in decisions(folder):
         if decision.need == need:
             return decision
@@ -82,14 +82,17 @@ def find_decision(folder: Path, need: str) -> Decision:
 
 
 def open_decisions(scene: bpy.types.Scene, folder: Path) -> list[Decision]:
-    """List the decisions of a run in the scene's list that the artist has not confirmed."""
+    """List the decisions of a run that the artist has not confirmed in this scene."""
     known = next((known for known in scene.refgs.runs if Path(known.folder) == folder), None)
     confirmed = set(known.confirmed.split()) if known else set()
     return [decision for decision in decisions(folder) if f"{decision.need}={decision.answer}" not in confirmed]
 
 
 def confirm(scene: bpy.types.Scene, folder: Path, need: str) -> None:
-    """Note that the artist keeps a decision of a run in the scene's list: `open_decisions` no longer lists it."""
+    """Note in the scene's list of runs that the artist keeps a run's decision. `open_decisions` then no longer lists the decision.
+
+    Raises InputError if the run has no such decision with pictures.
+    """
     decision = find_decision(folder, need)
     for known in scene.refgs.runs:
         if Path(known.folder) == folder:

@@ -60,7 +60,7 @@ def cloud_attributes(
     """Return the attributes that a point cloud needs: the arrays of `read_splats`, and how the normal changes across each splat.
 
     `normal_u` and `normal_v` (N, 3) are the change of the normal along the splat's first and second axis, per standard deviation. Blender's
-    types need more components: scale gets a third one and base_color a fourth, both 1.
+    vectors have three components and its colours four. So scale gets a third component and base_color a fourth, both 1.
     """
     one = np.ones((len(splats["position"]), 1), np.float32)
     return splats | {

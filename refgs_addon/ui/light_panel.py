@@ -40,8 +40,8 @@ def _lights(self, context: bpy.types.Context) -> list[tuple[str, str, str, int, 
 def _number(file: Path) -> int:
     """Compute the number of a panorama file in the menu of lights, as a hash of the file's path.
 
-    So the number stays the same when other files are added to the folder or removed. It is at least 2, because the menu uses 0 for the
-    recovered light and 1 (OTHER) for a light that is not in the list.
+    Because it is a hash, the number stays the same when other files are added to the folder or removed. It is at least 2, because the menu
+    uses 0 for the recovered light and 1 (OTHER) for a light that is not in the list.
     """
     return 2 + crc32(str(file).encode()) % (1 << 30)
 

@@ -24,8 +24,8 @@ FAILED = (1, 2)  # exit statuses after which a retry is useless
 class Step(NamedTuple):
     """Describe a step: its `name`, such as "train", the `run` it belongs to, and the `words` of its command after `refgs`.
 
-    `log` is the file for what it prints; the record is beside it. `made` is a file that is there once it is done, if there is one. `reads`
-    and `writes` are the files and folders that it works with; the log's is written.
+    `log` is the file for the command's output. The step's record is beside it. `made` is a file that must exist once the step is done, or
+    None. `reads` and `writes` are the files and folders that the step uses; the folder of `log` is one of `writes`.
     """
 
     name: str
@@ -59,7 +59,7 @@ class TryLater(Exception):
 
 
 def recorded(step: Step) -> Outcome | None:
-    """Return the outcome of a step that was done before. Return None if it was not done, or if its command was different."""
+    """Return the outcome of a step that succeeded before with the same command, if its file `made` still exists. Else return None."""
     from refgs.formats.progress import Record
     from refgs.formats.validate import read_json
 
@@ -73,13 +73,13 @@ def recorded(step: Step) -> Outcome | None:
 
 
 def run_step(step: Step, cores: int, pause: float, depot: Any, optional: tuple[bool, ...], *before: Outcome) -> Outcome:
-    """Run a step and record its outcome beside its log. A step that follows a failed one is not run.
+    """Run a step and record its outcome beside its log. If a step before it failed and may not fail, it is not run.
 
-    `cores` is the number of threads. `depot` has the files, if this may be another machine than the batch's; otherwise it is None. `before`
-    are the outcomes of the steps that it follows, and `optional` says which of these may fail.
+    `cores` is the number of threads. `depot` copies files from and to the batch's machine; it is None if all steps run there. `before` are
+    the outcomes of the steps that come before this one, and `optional` says which of these steps may fail.
 
-    If the command says that it may succeed later, if it was killed, or if the log or the record cannot be written, wait `pause` seconds and
-    raise TryLater.
+    Waits `pause` seconds and raises TryLater if the command was killed, if its exit status means that a retry may succeed, or if files
+    cannot be copied or written.
     """
     if any(outcome.status != 0 and not may_fail for outcome, may_fail in zip(before, optional, strict=True)):
         return Outcome(None)
@@ -101,7 +101,7 @@ def run_step(step: Step, cores: int, pause: float, depot: Any, optional: tuple[b
 
 
 def _run_and_record(step: Step, cores: int) -> Outcome:
-    """Run the command of a step. Record its outcome, unless a retry may change it."""
+    """Run the command of a step. Record its outcome only if a retry would not change it: a success, or a status in FAILED."""
     begun, node = time.monotonic(), platform.node()
     step.log.parent.mkdir(parents=True, exist_ok=True)
     step.running.touch()
@@ -118,9 +118,10 @@ def _run_and_record(step: Step, cores: int) -> Outcome:
 
 
 def _call(step: Step, cores: int, log) -> tuple[int, str]:
-    """Run the command of a step. Return its exit status and its output. However this call ends, the command ends with it.
+    """Run the command of a step. Return its exit status and its output.
 
-    The command ends when its input closes, which the system does if this process is killed.
+    The command ends when its input closes. This function closes the input if it is interrupted, and the system does if this process is
+    killed. So the command never runs on alone.
     """
     log.write(f"$ refgs {' '.join(step.words)}\n".encode())
     log.flush()

@@ -1,9 +1,9 @@
-"""Find the plane that an object stands on or hangs on, and learn its colours, so that it can be told from the object.
+"""Find the plane that an object stands on or hangs on, and learn its colours, so that pixels of the plane can be told from the object's.
 
-The photos are warped onto the plane. Each texel gets the median of the photos that see it, because the object hides another part of the
-plane in each photo. A pixel is not plane if its colour is not the one that its texel predicts. This works even where object and plane share
-colours. Shadows that stand still are part of the texture. Things that move, such as reflections in a shiny floor, differ between photos, so
-that their texels are uncertain.
+The photos are warped onto the plane. Each texel gets the median of the photos that see it, because the object hides different texels in
+each photo. A pixel does not show the plane if its colour differs from the colour that its texel predicts. This works even where object and
+plane share colours. Shadows that stand still are part of the texture. Things that move, such as reflections in a shiny floor, differ
+between photos, so their texels are uncertain.
 """
 
 from dataclasses import dataclass
@@ -46,10 +46,10 @@ class Plane:
 def find_plane(
     points: np.ndarray, centre: np.ndarray, radius: float, up: np.ndarray, positions: np.ndarray
 ) -> Plane | None:
-    """Find the plane that carries the object: a floor or a wall with many structure-from-motion points, and hardly any behind.
+    """Find the plane that carries the object: a floor or a wall with many structure-from-motion points, and hardly any points behind it.
 
-    `centre` and `radius` are a ball around the object, and `up` is the world's up direction. `positions` (N, 3) are those of the cameras,
-    which all are on the object's side. Return None if there is no such plane.
+    `centre` and `radius` are a ball around the object, and `up` is the world's up direction. `positions` (N, 3) are the cameras' positions.
+    If the plane is a wall, all cameras are in front of it. Return None if no plane is found.
     """
     near = points[np.linalg.norm(points - centre, axis=1) < 3 * radius]
     if len(near) < 50:
@@ -84,9 +84,9 @@ def find_plane(
 
 
 class Backdrop:
-    """Hold the colours of a plane, and how much they differ between photos, on a square grid of SIDE² texels around the object.
+    """Hold the colours of a plane, and how much each differs between photos, on a square grid of SIDE² texels around the object.
 
-    Colours are logarithms of 8-bit values, in steps. So a photo's exposure and white balance are an offset for each channel.
+    Colours are logarithms of 8-bit values, times STEPS. So a photo's exposure and white balance add one offset to each channel.
     """
 
     def __init__(self, plane: Plane, centre: np.ndarray, radius: float):
@@ -100,7 +100,7 @@ class Backdrop:
         self.to_world[3, 2] = 1
 
     def before(self, points: np.ndarray) -> np.ndarray:
-        """Mark the points (N, 3) that lie in front of the plane, not in it."""
+        """Mark the points (N, 3) that lie in front of the plane. Points nearer than ABOVE radii count as part of the plane."""
         return self.plane.height(points) > ABOVE * self.radius
 
     def learn(self, images: list[np.ndarray], cameras: list[Camera], hidden: list[np.ndarray]) -> None:
@@ -134,9 +134,10 @@ class Backdrop:
     def likelihood(self, image: np.ndarray, camera: Camera, hidden: np.ndarray) -> np.ndarray:
         """Return how well each pixel's colour fits the bare plane, as float32 (H, W).
 
-        It is the probability that the plane has a colour in the pixel's cell of the colour space, which has the size BIN. Where the texel's
-        colour is not known, as below the object, it is instead the negative of the odds of object to plane. Where the photos do not show
-        the plane, it is NaN.
+        - Where the plane's colour is known: the probability that the plane's colour lies in a box of the size BIN around the pixel's
+          colour, in Lab.
+        - Where the photos show the plane, but its colour is not known, as below the object: a negative number, −(odds of object to plane).
+        - Elsewhere: NaN. All pixels are NaN if fewer than 200 show the plane in a known colour.
 
         The photo's exposure and noise are measured on the pixels that are not `hidden`.
         """
@@ -160,7 +161,7 @@ class Backdrop:
         return np.where(known, np.minimum(result, 1), np.where(meets, -odds, np.float32(np.nan)))
 
     def _pixels_on(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return the texel at each pixel as a map for `remap` (H, W, 2), and where there is one (H, W)."""
+        """Find the texel that each pixel shows. Returns coordinates for `remap` (H, W, 2), and a mask (H, W) of pixels that show one."""
         column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         ray = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones_like(row)], axis=-1)
         ray = ray @ camera.world_to_camera[:3, :3]
@@ -173,7 +174,10 @@ class Backdrop:
         return texel, meets
 
     def _texels_in(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pixel of each texel as a map for `remap` (SIDE, SIDE, 2), and which texels the photo shows well enough."""
+        """Find the pixel that shows each texel. Returns pixel coordinates for `remap` (SIDE, SIDE, 2), and a mask (SIDE, SIDE).
+
+        The mask is false for texels that the photo does not show, or shows at an angle that is too grazing.
+        """
         column, row = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
         texel = np.stack([column, row, np.ones_like(row)], axis=-1)
         u, v, depth = np.moveaxis(texel @ (camera.projection @ self.to_world).T, -1, 0)
@@ -190,10 +194,10 @@ class Backdrop:
 def _median(
     stack: np.ndarray, used: np.ndarray, offset: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the median (N, 3) and the spread (N, 3) of texels over photos, and the photos' exposures (3, photos).
+    """Return the median (N, 3) and the spread (N, 3) of texels over photos, and the photos' exposures (3, photos), one for each channel.
 
-    `stack` (N, 3, photos) has the texels' logarithms, and `used` (N, photos) tells which of them count. Exposures are fitted unless
-    `offset` gives them.
+    `stack` (N, 3, photos) holds the logarithms of the texels' values, and `used` (N, photos) is true where a photo's value counts.
+    Exposures are offsets of the logarithms. They are fitted unless `offset` gives them.
     """
     count = used.sum(axis=1)
     values = np.where(used[:, None], stack, np.float32(np.nan))

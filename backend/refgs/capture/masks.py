@@ -56,18 +56,19 @@ def make_masks(
 
     `wanted` may set a box around the object, as for `read_capture`. Its up direction is not used. Without a box, the object is guessed
     (`guess_box`), and the guess is reported as the event "region". `report(event, facts)` is also called with "progress" and "warning".
-    `model` is an ONNX file (`SalienceModel`) that finds the object's pixels. Without it, colours do.
+    `model` is an ONNX file (`SalienceModel`) that finds the object's pixels. Without a model, the object is found by colours.
 
     Returns a dict:
 
     - `photos`, `made`, `kept`: the numbers of photos, of new masks and of kept masks.
     - `objects`: the number of separate objects.
-    - `region`: the box around them, as settings for a training with the new masks.
-    - `moved`: the matrix (4, 4), as a list, by which the new masks move the capture's frame: p_new = moved @ p.
+    - `region`: the box around the objects, as settings for a training with the new masks.
+    - `moved`: a matrix (4, 4), as a list of rows. The frame of a training depends on the masks. The matrix maps the frame with the earlier
+      masks to the frame with the new masks: p_new = moved @ p.
 
     All masks are written together at the end. An interrupted call leaves the earlier masks. Raises InputError if the artist has made all
-    masks already, if the artist's masks are all white, if strokes or the model do not fit, or if nothing is found. Raises ReadOnlyError if
-    the folder cannot be written to.
+    masks already, if the artist's masks are all white, if strokes do not fit their photo, if the model cannot be used, or if no object is
+    found. Raises ReadOnlyError if the folder cannot be written to.
     """
     return with_masks(read_files(folder), wanted, report, model)[1]
 
@@ -78,7 +79,7 @@ def with_masks(
     report: Report,
     model: Path | None = None,
 ) -> tuple[CaptureFiles, dict[str, Any]]:
-    """Make masks of a capture that is read already. Return the capture with its new masks, and the dict that `make_masks` returns."""
+    """Make masks of a capture from its files. Return the files with the new masks, and the dict that `make_masks` returns."""
     folder = files.folder
     judge = _Judge(SalienceModel(model)) if model is not None else None
     capture = to_run_frame(files, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
@@ -180,7 +181,7 @@ def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, float]:
 
 
 def region_settings(box: Box) -> list[str]:
-    """Return a box whose edges are parallel to the axes as settings of a training: region.centre and region.size."""
+    """Return the settings region.centre and region.size of a box. The box's edges must be parallel to the axes."""
     size = 2 * np.linalg.norm(box.matrix[:3, :3], axis=0)
     return [
         f"region.{key}={[round(float(x), 4) + 0.0 for x in values]}"
@@ -189,14 +190,14 @@ def region_settings(box: Box) -> list[str]:
 
 
 def moved_region(wanted: RegionSettings, moved: list[list[float]]) -> RegionSettings:
-    """Return a box in the frame that new masks have moved. `moved` (4, 4) is what `make_masks` returns."""
+    """Convert a box to the frame that a training has with the new masks. `moved` (4, 4) is in the dict that `make_masks` returns."""
     scale = sum(row[0] ** 2 for row in moved[:3]) ** 0.5
     centre = tuple(sum(a * b for a, b in zip(row, (*wanted.centre, 1.0), strict=True)) for row in moved[:3])
     return wanted.model_copy(update={"centre": centre, "size": tuple(scale * edge for edge in wanted.size)})
 
 
 def masks_folder(capture: Capture) -> Path:
-    """Return the folder into which a capture's masks are made. Raises InputError if its masks can only be in its photos."""
+    """Return the folder for a capture's masks. Raises InputError if the capture's layout stores masks in its photos or depth maps."""
     return _root(capture) / "masks"
 
 
@@ -238,7 +239,7 @@ def _inner(view: View, root: Path) -> Path:
 
 
 def _targets(root: Path, views: list[View]) -> dict[View, Path]:
-    """Return the mask file of each photo that has none yet. Photos that differ only in their suffix keep it, as in 1.jpg.png."""
+    """Map each photo without a mask to its mask file NAME.png, or to NAME.jpg.png if photos differ only in their suffix."""
     names = [_inner(view, root) for view in views]
     stems = Counter(name.with_suffix("") for name in names)
     files = (
@@ -260,7 +261,7 @@ def _hashes(root: Path) -> set[str]:
 
 
 def _choose(views: list[View], root: Path) -> list[View]:
-    """Choose the photos to carve by: some evenly spaced ones, and all for which there are masks or strokes by the artist."""
+    """Choose the photos that carve the object: some evenly spaced photos, and all photos that have the artist's mask or strokes."""
     every = max(1, -(-len(views) // CARVED_BY))
     return [view for i, view in enumerate(views) if i % every == 0 or view.masked or _stroke_file(view, root)]
 
@@ -289,7 +290,7 @@ class _Judge:
 
 
 def _load(view: View, root: Path, side: int, judge: _Judge | None) -> Photo:
-    """Load a photo, undistorted and reduced, with what the model and the artist's mask or strokes tell about its pixels."""
+    """Load a photo, undistorted and reduced. Add what the artist's mask or strokes say about its pixels, and the model's probabilities."""
     loaded = load_view(view, side)
     known = np.zeros(loaded.image.shape[:2], np.int8)
     if loaded.alpha is not None:
@@ -303,7 +304,8 @@ def _load(view: View, root: Path, side: int, judge: _Judge | None) -> Photo:
 def _read_strokes(file: Path, view: View, camera: Camera) -> np.ndarray:
     """Read an artist's strokes as int8 (H, W): 1 is the object, −1 is not, 0 is unmarked.
 
-    They are undistorted and resized to `camera`, as the photo is.
+    The strokes are undistorted and resized to `camera`, like the photo. Raises InputError if they lack transparency, or if their shape is
+    not the photo's.
     """
     color, alpha = read_image(file)
     height, width = color.shape[:2]
@@ -348,7 +350,10 @@ def _to_photo(view: View, mask: np.ndarray) -> np.ndarray:
 
 
 def _put(files: dict[Path, Path], root: Path, before: set[str]) -> None:
-    """Move the new masks to their places, and note their hashes. They are noted first, so that no mask is ever taken for the artist's."""
+    """Move the new masks to their places, and record their hashes.
+
+    The hashes are recorded first. So after an interruption, no mask of the program is taken for the artist's.
+    """
     (root / "masks").mkdir(exist_ok=True)
     now = {_hash(path) for path in files}
     write_text(root / "masks" / MADE, json.dumps(sorted(before | now)))

@@ -40,9 +40,9 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.nda
 def _without_deleted(found: Transforms, file: Path) -> tuple[list[Frame], list[str]]:
     """Drop frames whose photos are missing, but only from instant-ngp's files. Return the frames that are left, and warnings.
 
-    Users of instant-ngp delete blurred photos and leave their frames in the file; instant-ngp ignores these frames. All frames are
-    returned if the file is another program's, or if more than half of the photos are missing; the caller then
-    raises an error that names a missing photo.
+    Users of instant-ngp delete blurred photos and leave their frames in the file; instant-ngp ignores these frames. All frames are returned
+    if another program wrote the file, or if more than half of the photos are missing. If a photo is missing then, the caller raises an
+    error that names it.
     """
     frames = found.frames
     missing = [frame.path for frame in frames if find_image(file.parent / frame.path) is None]

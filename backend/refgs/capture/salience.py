@@ -27,9 +27,10 @@ MEAN, DEVIATION = (
 class SalienceModel:
     """Model of salient-object segmentation, such as U²-Net, IS-Net or BiRefNet, on the CPU.
 
-    Its input is (1, 3, height, width) float32 RGB, normalised as for ImageNet. Its first output is one map: probabilities; logits if some
-    are negative; values of any scale if some are greater than 1. `side` is the longer side of its input, in pixels.
-    Raises InputError if the file is no such model, if it is damaged, or if ONNX Runtime is not installed.
+    Its input is (1, 3, height, width) float32 RGB, normalised as for ImageNet. Its first output is one map. If a value is negative, the
+    values are taken for logits. Otherwise, if a value is greater than 1, the values are scaled to 0..1. Otherwise they are probabilities.
+    `side` is the longer side of the input, in pixels. Raises InputError if the file is missing, damaged or another type of model, or if
+    ONNX Runtime is not installed.
     """
 
     def __init__(self, file: Path):
@@ -72,9 +73,9 @@ class SalienceModel:
 
 
 def _child(file: Path, pipe: Connection) -> None:
-    """Run a model in this process. Send the height and width of its input first, then a map for each photo that comes.
+    """Run a model in this process. First send the height and width of its input. Then, for each photo received, send its probabilities.
 
-    If the model or a photo does not work, send the InputError and end.
+    If the model or a photo fails, send the InputError and end.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     try:

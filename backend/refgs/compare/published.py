@@ -27,7 +27,7 @@ _FORWARD_LEFT_UP = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float32)
 class TensoIRTruth(GroundTruth):
     """Read the true normals and base colour of a scene of TensoIR-Synthetic, and its views under other lights.
 
-    `folder` is the scene's. The names of views are those of their folders.
+    `folder` is the scene's folder. It has a folder for each view, with the view's name.
     """
 
     def _find(self) -> None:
@@ -67,8 +67,8 @@ class TensoIRTruth(GroundTruth):
 class StanfordORBTruth(GroundTruth):
     """Read the true normals, depths and base colour of a scene of Stanford-ORB, and photos of its object under the lights of other scenes.
 
-    `folder` is the scene's. Maps are those of its test photos. Normals are stored by OpenGL's camera axes
-    (`scripts/preprocess/mesh_to_depth.py` in Stanford-ORB's repository), base colour sRGB-encoded (`orb/utils/test.py`).
+    `folder` is the scene's folder. There are true maps for its test photos. Their files hold normals in OpenGL's camera axes
+    (`scripts/preprocess/mesh_to_depth.py` in Stanford-ORB's repository), and base colour sRGB-encoded (`orb/utils/test.py`).
     """
 
     def _find(self) -> None:
@@ -111,8 +111,8 @@ class StanfordORBTruth(GroundTruth):
     def light(self, view: View) -> np.ndarray:
         """Read the light of a photo. Return a panorama (H, W, 3), rotated to the coordinates of the training.
 
-        The file has the directions of the camera: the middle is where it looks, right is right and up is up. This is the convention of
-        `env_map_to_cam_to_world_by_convention` in `orb/utils/env_map.py` of Stanford-ORB's repository.
+        The file is in the camera's coordinates. Its middle is the direction in which the camera looks, and its right and top are the
+        camera's. This is the convention of `env_map_to_cam_to_world_by_convention` in `orb/utils/env_map.py` of Stanford-ORB's repository.
         """
         scene = view.image_path.resolve().parent.parent.name
         panorama = read_environment(self._truths / scene / "env_map" / f"{view.image_path.stem}.exr")

@@ -14,7 +14,7 @@ Seconds = Annotated[Finite, Field(ge=0)]
 class Facts(Model):
     """Hold what a checkpoint knows besides its tensors.
 
-    `parts` are the facts of each part of the training that remembers something, by its name. `clock` are seconds by part of an iteration.
+    `parts` maps the name of each `refgs.train.part.Part` to its facts. `clock` maps each part of an iteration to the seconds spent in it.
     """
 
     iteration: Count

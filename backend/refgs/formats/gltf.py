@@ -30,7 +30,7 @@ def write_glb(path: str | os.PathLike, mesh: UnwrappedMesh, textures: Textures) 
     - base colour, sRGB-encoded
     - occlusion, roughness and metallic, linear, as R, G and B of one picture
     - the normal map
-    - the MikkTSpace tangents that the normal map was made with. Some programs do not compute them.
+    - the MikkTSpace tangents that the normal map was made with, because some programs do not compute tangents
     - the extension KHR_materials_specular, only if specular reflection must be turned off
 
     The maps are also written as files beside the mesh, by `write_textures`.

@@ -13,19 +13,22 @@ class _Figures(RootModel[dict[str, JsonValue]]):
 
 
 class Said(Model):
-    """Hold a sentence for the user about a measurement, if there is one."""
+    """Hold `what`, a sentence for the user about a measurement. It is None if there is nothing to tell."""
 
     what: str | None = None
 
 
 class Metrics(Model):
-    """Hold what metrics.json has besides figures: `ambiguities` and `doubt` are what photos cannot tell apart."""
+    """Hold the texts in metrics.json, which say what photos cannot tell apart.
+
+    `ambiguities` are changes of light and materials that cancel in all pictures. `doubt` is about metal and paint.
+    """
 
     ambiguities: dict[str, Said] = Field(default_factory=dict)
     doubt: Said | None = None
 
     def said(self) -> list[str]:
-        """Return the sentences about what photos cannot tell apart: changes to the scene, and metal from paint."""
+        """Return the sentences that `ambiguities` and `doubt` hold."""
         return [about.what for about in (*self.ambiguities.values(), self.doubt) if about and about.what]
 
 

@@ -20,7 +20,10 @@ Inside = Annotated[str, AfterValidator(_inside)]
 
 
 class Pictures(Model):
-    """Name the pictures with and without a part, which are files in the run folder, and the photo. PSNRs are in dB."""
+    """Name three pictures of a view: with an optional part of the training (`on`), without it (`off`), and the photo.
+
+    The pictures are files in the run folder. PSNRs are against the photo, in dB.
+    """
 
     on: Inside
     off: Inside
@@ -34,8 +37,8 @@ class Found(Model):
     """Hold the decision about an optional part of a training, as checkpoints keep it.
 
     `statistic` was compared with `threshold`. Leaving the part out saves `seconds` and `megabytes`, and costs `decibels` of PSNR on the
-    training views. `side` is the reduced resolution for the part `light`, `total` the reduced number of iterations for `iterations`.
-    `again` is the value that the second look at a matte scene measured.
+    training views. `side` is the reduced resolution for the part `light`, `total` the reduced number of iterations for `iterations`. A
+    matte scene is measured a second time, halfway through the training; `again` is the result.
     """
 
     needed: bool
@@ -66,7 +69,7 @@ class Row(Model):
     @field_validator("pictures", mode="wrap")
     @classmethod
     def _whole(cls, value: Any, handler: Any) -> Pictures | None:
-        """Leave out incomplete pictures, because a row is useful without them."""
+        """Replace incomplete pictures by None, because a row is useful without pictures."""
         try:
             return handler(value)
         except ValidationError:

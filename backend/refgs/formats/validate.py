@@ -42,12 +42,12 @@ def read_toml(file: Path, model: type[M], again: str) -> M:
 
 
 def read_tables(file: Path, again: str) -> dict[str, Any]:
-    """Read a TOML file as nested dicts. Raises InputError, which ends with `again`, if it is missing or no TOML."""
+    """Read a TOML file as nested dicts. Raises InputError if the file is missing or not TOML. `again`, the advice, ends the message."""
     return parse_toml(read_text(file, again), str(file), again)
 
 
 def parse_json(text: str, source: str, again: str) -> Any:
-    """Parse JSON. Raises InputError, which begins with the `source` and ends with `again`."""
+    """Parse JSON. Raises InputError, whose message begins with `source` and ends with `again`, the advice."""
     return _parsed(json.loads, text, source, "JSON", again)
 
 
@@ -69,7 +69,10 @@ def _parsed(loads: Callable[[str], Any], text: str, source: str, kind: str, agai
 
 
 def validated(data: Any, model: type[M], source: str, again: str) -> M:
-    """Make a model of what `json` or `tomllib` returned. Raises InputError, which begins with the `source` and ends with `again`."""
+    """Make a model of what `json` or `tomllib` returned.
+
+    Raises InputError if the data does not fit the model. The message begins with `source` and ends with `again`, the advice.
+    """
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -81,7 +84,10 @@ def validated(data: Any, model: type[M], source: str, again: str) -> M:
 
 
 def _place(error: Any, data: Any) -> tuple[list[str], str]:
-    """Describe where a field is: the frame whose `file_path` is above it, if there is one, and the field's keys joined by dots."""
+    """Return where pydantic found an error: in which frame, as a list of at most one text, and the field's keys joined by dots.
+
+    A frame is a dict with a `file_path`, as in transforms.json. The list is empty for a field outside all frames.
+    """
     where, keys = [], []
     for part in error["loc"]:
         known = range(len(data)) if isinstance(data, list) else data if isinstance(data, dict) else ()

@@ -16,7 +16,7 @@ def clean(mesh: Mesh, triangles: int) -> SmoothMesh:
     """Clean up a mesh, simplify it to about `triangles` faces if it has more, and compute smooth normals.
 
     - Crumbs are removed: connected parts with less than KEEP times the largest part's area.
-    - Holes of at most HOLE edges are closed. Objects have none: no photo shows the surface there.
+    - Holes of at most HOLE edges are closed. They are no holes of the object: only photos of the surface are missing there.
     - Frays are removed: strips at a border of the surface in which no vertex is FRAY faces away from the border. A closed surface has no
       border, however thin it is.
 
@@ -58,13 +58,13 @@ def clean(mesh: Mesh, triangles: int) -> SmoothMesh:
 
 
 def _large(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Mark the faces (F,) of the parts that are no crumbs, as `clean` defines them."""
+    """Mark the faces (F,) that do not belong to crumbs, as `clean` defines them."""
     part, areas = parts(mesh)
     return (areas >= KEEP * areas.max())[part]
 
 
 def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Close small holes, as `clean` defines them, each by a fan of triangles about the mean of its vertices."""
+    """Close small holes, as `clean` defines them. Each is filled with a fan of triangles around the mean of the hole's vertices."""
     border = _border(mesh)
     if not len(border):
         return mesh
@@ -99,7 +99,7 @@ def _untrimmed(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def _border(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Return the edges (B, 2) of one face only, as vertex numbers in the face's winding."""
+    """Return the edges (B, 2) that belong to one face only: two vertex numbers each, in the order of the face's winding."""
     _, edge, faces = np.unique(mesh.edges_sorted, axis=0, return_inverse=True, return_counts=True)
     return mesh.edges[faces[edge.reshape(-1)] == 1]
 

@@ -6,6 +6,6 @@ import torch
 
 
 class Function(torch.autograd.Function):
-    """Differentiate by kernels. `backward` takes a gradient for each result of `forward`, by position."""
+    """Run kernels as an autograd function. `backward` takes one gradient for each result of `forward`, in the same order."""
 
     backward: Any  # torch declares it with any number of gradients, which no function with a fixed number matches

@@ -28,7 +28,7 @@ _Work = struct("Adam", "adam.cpp")
 
 @dataclass
 class Moments:
-    """Hold Adam's moments of a tensor: the running `mean` of its gradient and of the gradient's `square`, after so many `steps`."""
+    """Hold Adam's moments of a tensor after `steps` steps: the running means of its gradient (`mean`) and of the gradient's `square`."""
 
     steps: int
     mean: Tensor
@@ -114,11 +114,11 @@ class Learned(Mapping[str, Tensor]):
 
     @torch.no_grad()
     def rows(self, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
-        """Rebuild all surfels from the rows `index` of their tensors. A row may be taken more than once.
+        """Replace all surfels: surfel i of the result is a copy of surfel `index`[i]. An index may occur more than once.
 
-        Each row keeps its moments, except that rows of the result with an index in `fresh` start with zero moments. Adam then moves these
-        rows faster than others at first. Pictures get worse for a while, but for captures without masks, the final result is better. If
-        memory runs out, all surfels stay as they were.
+        Each surfel keeps its moments, except that surfels of the result with an index in `fresh` start with zero moments. Adam then moves
+        these surfels faster than others at first. Pictures get worse for a while, but for captures without masks, the final result is
+        better. If memory runs out, all surfels stay as they were.
         """
         values = {name: _leaf(value.detach()[index]) for name, value in self.by_row.items()}
         moments = {}
@@ -194,7 +194,7 @@ class Learned(Mapping[str, Tensor]):
         run("refgs_adam_step", work, kept[0], items=sum(gradient.numel() for gradient in kept))
 
     def save(self) -> dict[str, Tensor]:
-        """Return all tensors and moments for a checkpoint, by names that `load` knows."""
+        """Return all tensors and moments for a checkpoint, by the names under which `load` looks for them."""
         tensors = {self._kept(name): value for name, value in self._values.items()}
         tensors |= {f"constant.{name}": value for name, value in self.constant.items()}
         for name, moments in self.moments.items():
@@ -205,9 +205,9 @@ class Learned(Mapping[str, Tensor]):
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         """Take over a checkpoint's values of the tensors that are learned or constant here.
 
-        A parameter may have been left out, or brought back, after the checkpoint was written. If it is constant there and learned here, its
-        one row is repeated for all surfels. If it is learned there and constant here, its first row is taken. A learned tensor that is not
-        by row is dropped if the checkpoint lacks it. Raises KeyError if any other tensor is missing.
+        A parameter may be constant in the checkpoint and learned here: then its one row is repeated for all surfels. It may be learned in
+        the checkpoint and constant here: then its first row is taken. A learned tensor that is not by row is dropped if the checkpoint
+        lacks it. Raises KeyError if any other tensor is missing.
         """
         rows = len(tensors["parameter.position"])
         self.moments.clear()

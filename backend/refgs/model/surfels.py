@@ -173,9 +173,9 @@ def initial_parameters(
 ) -> Parameters:
     """Make the raw parameters of N round surfels at `positions` (N, 3) with unit `normals` (N, 3).
 
-    `spacing` (N,) becomes the surfels' standard deviation. `colours` (N, 3), sRGB-encoded in 0..1, become the colours; None is grey. The
-    other arguments are the same for all surfels. With `axes=3` the result is 3D Gaussians, whose third scale, along the normal, is FLAT
-    times the other two.
+    `spacing` (N,) becomes the surfels' standard deviation. `colours` (N, 3), sRGB-encoded in 0..1, become the colours; without them, all
+    surfels are grey. The other arguments are the same for all surfels. With `axes=3` the result is 3D Gaussians, whose third scale, along
+    the normal, is FLAT times the other two.
     """
     n = len(positions)
 

@@ -29,9 +29,9 @@ def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress:
     the surface and face outwards. A splat's alpha is its opacity times its Gaussian where the ray meets the splat's plane. The result is
     divided by the sum of the weights. If no splat meets the ray, the nearest splats give the values.
 
-    The blended normal belongs to the mean position of the splats, not to the point. So the change of the normals with position is fitted to
-    the splats by weighted least squares, and the blended normal is corrected by it. `progress` is called with the number of points done and
-    their total.
+    The blended normal is right at the mean position of the splats, not at the point. So a slope, the change of the normal with position, is
+    fitted to the splats by weighted least squares. The slope times the distance corrects the blended normal. `progress` is called with the
+    number of points done and their total.
     """
     table, values = _geometry(splats), _appearance(splats)
     spread = float(np.median(splats.scales[:, :2].mean(axis=1))) or 1.0
@@ -59,7 +59,8 @@ def blended_normals(splats: Splats) -> np.ndarray:
     """Compute the unit normal (N, 3) of the surface at each splat: `composite` at the splats' positions.
 
     The learned normals of splats that share a pixel differ by 16° to 24°, though their blend is right to a degree or two. Programs that
-    shade each splat by itself, as Blender does, need the blend. Where it lies beyond the splat's plane, the splat's own normal is returned.
+    shade each splat by itself, as Blender does, need the blend. If the blend points to the back of the splat's plane, the splat's own
+    normal is returned instead.
     """
     own = _outward(splats)
     blended = composite(splats, splats.positions, own, lambda done, total: None)[:, NORMAL]
@@ -67,7 +68,7 @@ def blended_normals(splats: Splats) -> np.ndarray:
 
 
 def _outward(splats: Splats) -> np.ndarray:
-    """Return the normals (N, 3) of the splats' planes, as learned, to the side of `splats.normals`."""
+    """Return the learned normals (N, 3) of the splats' planes, flipped to the side to which `splats.normals` point."""
     plane = axes(torch.from_numpy(splats.rotations))[2].numpy()
     return np.where((plane * splats.normals).sum(axis=1, keepdims=True) < 0, -plane, plane)
 

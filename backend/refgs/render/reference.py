@@ -262,10 +262,10 @@ def _cube_margins(directions: Tensor, sides: list[Tensor], margins: list) -> Non
 
 
 def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor, margins: list) -> Tensor:
-    """Look up the prefiltered light (P, 3) in unit directions (P, 3) for roughnesses (P,).
+    """Look up the prefiltered light in P unit directions (P, 3), for roughnesses (P,). Returns the radiance (P, 3).
 
-    `levels` are what `prefilter` returns, with the sides `sides`. Distances from jumps of the derivatives are appended to `margins` (see
-    `shade`).
+    `levels` are what `prefilter` returns, with the sides `sides`. At some values, derivatives jump. The distances from these values are
+    appended to `margins` (see `shade`).
     """
     known, alpha = torch.tensor(prefilter.ROUGHNESS, dtype=roughness.dtype), roughness**2
     interval = (torch.bucketize(roughness.detach().contiguous(), known) - 1).clamp(0, len(known) - 2)

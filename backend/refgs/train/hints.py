@@ -28,7 +28,7 @@ MIRROR = {"albedo": 0.8, "roughness": 0.1}
 
 
 def continue_with_hints(state: State, run: Path, hints: list[Hint]) -> None:
-    """Take over what a finished `run` has learned, return to an earlier iteration, and hold the materials of the hinted parts.
+    """Take over what a finished `run` has learned, return to an earlier iteration, and hold the metallic of the hinted parts.
 
     Hinted metals start as a bright mirror, because the base colour that they had as plastic tells nothing. Hinted paint keeps its base
     colour and roughness, because rough metal looks much like paint of its colour. The residual of all surfels starts anew.
@@ -65,10 +65,10 @@ def hinted_kinds(state: State, splats: np.ndarray, hints: list[Hint]) -> torch.T
 
 
 def _go_back(state: State) -> None:
-    """Set the iteration to the fraction AGAIN of the total, and start the clocks anew.
+    """Set the iteration to the fraction AGAIN of the total, and set the training's times to zero.
 
-    With a time limit, the total is chosen so that the remaining iterations fill the time that is left. Without one, AT_MOST becomes the
-    limit if the remaining iterations would take longer.
+    With a time limit, the total is chosen so that the remaining iterations fill the time that is left. Without a limit, AT_MOST
+    minutes become the limit if the remaining iterations would take longer.
     """
     count, pace, plan = (1 - AGAIN) * state.total, state.seconds / max(state.iteration, 1), state.plan
     state.seconds = plan.before = 0.0

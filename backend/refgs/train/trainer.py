@@ -60,7 +60,7 @@ ACTIONS: dict[str, Callable[[State, Step], object]] = {
 
 
 def walk(rows: tuple[Row, ...], state: State, step: Step) -> None:
-    """Do what is due in the rows of a timeline, in their order."""
+    """Run the actions of the timeline's `rows` that are due at this step, in the order of the rows."""
     for row in rows:
         if row.due(state, step):
             with state.clock.part(row.clock) if row.clock else nullcontext():
@@ -220,7 +220,7 @@ class Trainer:
             warn(state, why)
 
     def release_photos(self) -> None:
-        """Drop all photos when the training has ended. Windows cannot remove their files while they are mapped."""
+        """Drop all photos after the training. They may be mapped from files, which Windows cannot remove as long as they are mapped."""
         self.state.views, self.state.photos, self.state.test = [], [], []
         self.state.part(coarse.Coarse).photos = []
         del self.measures

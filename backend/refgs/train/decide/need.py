@@ -46,8 +46,8 @@ class Given(NamedTuple):
 
     - `done`: how many iterations are done.
     - `hidden`: the fraction of the object's pixels that mirror the object.
-    - `common`: the common values of metallic and roughness, if nearly all surfels in `kept` share one: by name, the value and the range's
-      width.
+    - `common`: each of "metallic" and "roughness" that is nearly equal for all surfels in splats.ply, with its value and its range's width.
+    - `kept`: the number of surfels in splats.ply.
     """
 
     done: int = 0
@@ -89,7 +89,8 @@ class Need:
     def undo(self, state: State, why: str) -> None:
         """Bring this optional part of the training back, after `apply` has left it out. `why` is the reason, for the record.
 
-        Only parts whose decision can be taken back have this method. It may be called again.
+        Only parts whose decision can be taken back have this method. It may be called again if the training returns to an earlier
+        checkpoint.
         """
         raise NotImplementedError
 

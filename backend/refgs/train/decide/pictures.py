@@ -26,10 +26,10 @@ Pair = Callable[[State, Found, list[int]], Iterator[tuple[Tensor, Tensor]]]
 
 @torch.no_grad()
 def write_pictures(state: State, name: str, found: Found) -> Pictures | None:
-    """Write pictures of both answers to the need `name`, and of the photo, for the view in which the answers differ most.
+    """Write pictures for the decision about the need `name`: with the part, without it, and the photo.
 
-    `found` is the recorded decision. Returns the view's name, the files' paths in the run folder, and the PSNR of both pictures of this
-    view, in dB. Returns None for a need without pictures.
+    The pictures show the view in which the two renderings differ most. `found` is the recorded decision. Returns the view's name, the
+    files' paths in the run folder, and the PSNR of both renderings, in dB. Returns None for a need without pictures.
     """
     if name not in PAIRS:
         return None
@@ -63,14 +63,14 @@ def _reduced(picture: Tensor) -> np.ndarray:
 
 
 def _specular(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render the views with reflections, and with reflections that do not change with the view."""
+    """Render each view twice: with reflections, and with each surfel's mean reflection, which is the same in all views."""
     return probe.mirrored_and_mean(state, state.inputs(), views)
 
 
 def _reflections(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render two guesses at what the object mirrors where it hides the light: its own mean radiance, and the light behind it.
+    """Render each view twice. Where the object mirrors itself, it shows its mean radiance first, then the light behind it.
 
-    What the object mirrors of itself is not known before it is traced.
+    Both are guesses, because what the object mirrors of itself is not known before it is traced. Yields nothing without a mesh.
     """
     inputs = state.inputs()
     if inputs.occluder is None:

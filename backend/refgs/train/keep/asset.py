@@ -35,10 +35,12 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
     """Write the results of a training into its run folder.
 
     These are the surfels (splats.ply), the light (environment.exr), and what the training left out (needs.json). With inter-reflection, the
-    object's mesh is written to occluder.ply. With learned exposures or poses, cameras.json is written again to include them. If photos
-    decide what is metal, splats.ply also has each surfel's doubt, and metrics.json has the fraction of the surface that is in doubt.
+    object's mesh is written to occluder.ply. With learned exposures or poses, cameras.json is written again to include them. If the
+    training decides from the photos what is metal, splats.ply also has each surfel's doubt, and metrics.json has the fraction of the
+    surface that is in doubt.
 
-    A run that has splats.ply counts as finished. So this file is written last, after `before_splats` is called.
+    A run that has splats.ply counts as finished. So this file is written last, after `before_splats` is called. Raises InputError if the
+    photos show nothing in the region.
     """
     with torch.no_grad():
         surfels = with_normals_last(state.surfels())
@@ -105,9 +107,9 @@ REWRITES = (_without_unlearned, _without_untraced, _with_relightable_albedo)
 
 
 def _with_constants(surfels: Surfels, state: State, kept: Tensor) -> tuple[Surfels, dict[str, float]]:
-    """Set metallic, roughness and specular to one value for all surfels, if they are about the same. Return these values by name, too.
+    """Give all surfels the same metallic, roughness or specular, if theirs are nearly equal. Return the surfels, and the values by name.
 
-    splats.ply then needs no column for them. Only surfels whose entry in `kept` (N,) is true are compared.
+    splats.ply then needs no column for these values. Only surfels whose entry in `kept` (N,) is true are compared.
     """
     if state.settings.render.reflection == "none" and state.method.lit:
         constants = {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}

@@ -135,7 +135,7 @@ class Measures:
     def _relit(self, state: State) -> float:
         """Render the first SLOW_VIEWS held-out views under another light, and return the PSNR against their true pictures.
 
-        One factor first scales all renderings to fit the truth best.
+        First, all renderings are multiplied by the one factor that fits them best to the true pictures.
         """
         settings = self.settings.render.model_copy(update={"reflection": "microfacet"})
         surfels = state.surfels().without_directions()

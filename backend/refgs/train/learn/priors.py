@@ -130,9 +130,9 @@ def depth_loss(
 
 
 def at_pixels(values: Tensor, camera: Camera, pixels: Camera) -> Tensor:
-    """Look up a map (H, W, …) of `camera` at the pixels of another camera, and take the nearest values.
+    """Look up a map (H, W, …) of `camera` at the pixels of the camera `pixels`. Returns the nearest values.
 
-    That camera is in the same place. It may have another size, or be a crop.
+    Both cameras have the same pose. `pixels` may have another size, or be a crop.
     """
     found = []
     for axis, (size, focal, centre) in enumerate((("height", "fy", "cy"), ("width", "fx", "cx"))):
@@ -145,8 +145,8 @@ def at_pixels(values: Tensor, camera: Camera, pixels: Camera) -> Tensor:
 def fitted(guessed: Tensor, depth: Tensor, counts: Tensor, disparity: bool, radius: float) -> tuple[Tensor, Tensor]:
     """Scale and shift guessed depth or disparity (H, W) to fit `depth` (H, W) best, by robust least squares.
 
-    Pixels are weighted by `counts`, and by less the farther they are from the fit (Cauchy's weights, at FAR scene radii). Returns the depth
-    (H, W), and a scalar: 1, or 0 if the guess falls where depth rises. Neither has gradients.
+    Pixels are weighted by `counts`, and by less the farther they are from the fit (Cauchy's weights, at FAR scene radii). Returns the
+    fitted depth (H, W), and a scalar: 1 if the fitted scale is positive, else 0. `depth` must be detached.
     """
     wanted = 1 / depth.clamp_min(1e-6 * radius) if disparity else depth
     weight, found, slope = counts, depth, counts
@@ -170,7 +170,7 @@ def axes_of(pairs: Iterable[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor | No
     - the guessed ones turned to the camera's axes, as if those in the file were in world space
 
     Returns the signs (3,) by which to multiply the file's x, y and z, or None if the normals are in world space. The answer with the larger
-    mean cosine is chosen. Also returns how well x and y agree then: the smaller of their correlations.
+    mean cosine is chosen. Also returns how well the guesses then agree with the surface: the smaller of the correlations in x and in y.
     """
     sums = torch.zeros(2, 3, 3, dtype=torch.float64)
     for seen, *guesses in pairs:
@@ -238,7 +238,7 @@ def _near_outline(photo: Photo) -> Tensor:
 
 
 def _with_kind(state: State, depth: Maps) -> tuple[Maps, bool]:
-    """Return the maps of depth, and whether they hold disparities. Drop all if they are unlike the depth of the first surfels.
+    """Return the maps of depth, and whether they hold disparities. Return no maps if they do not correlate with the first surfels' depth.
 
     Disparity falls where depth rises, so its correlation with depth is negative.
     """

@@ -37,12 +37,12 @@ METAL_TINT = 0.6  # tint of the change (0: grey as a dielectric's reflection; 1:
 class Shining(NamedTuple):
     """Mark the surfels whose radiance changes with the view as that of a coloured metal. Each field is a bool mask (N,).
 
-    - `clearly`: surfels whose change is above CHANGES, relative to their mean radiance. The mask grows to neighbours whose change is
-      above FAINT_CHANGES.
+    - `clearly`: surfels whose change is above CHANGES, relative to their mean radiance. The mask grows to neighbours whose change is above
+      FAINT_CHANGES.
     - `faintly`: surfels whose change is above FAINTEST_CHANGES.
     - `tells`: surfels that can be judged, because they are coloured and enough photos see them.
 
-    `clearly` and `faintly` have only surfels that change along their own colour.
+    `clearly` and `faintly` mark only surfels whose radiance changes along their own colour.
     """
 
     clearly: Tensor
