@@ -22,8 +22,8 @@ _watching: "Clock | None" = None
 class Clock:
     """Add up the seconds that a device spends in each part of a training.
 
-    `seconds` maps a part's name to its total. `processor` are the seconds of all threads in all iterations, which other programs hardly
-    change.
+    `seconds` maps a part's name to its total. `processor` is the CPU time in seconds of all threads in all iterations. Other programs on
+    the machine hardly influence it.
     """
 
     def __init__(self, device: torch.device):
@@ -91,7 +91,7 @@ class Clock:
 
 
 def _event() -> torch.cuda.Event:
-    """Record an event on a card, which tells the time when the card comes to it."""
+    """Record an event in the card's queue of work. The event holds the time at which the card reaches it."""
     event = torch.cuda.Event(enable_timing=True)
     event.record()
     return event

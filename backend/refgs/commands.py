@@ -105,8 +105,8 @@ def poses(folder: Path, once: bool = False) -> None:
 def masks(folder: Path, changes: list[str], model: Path | None = None, once: bool = False) -> None:
     """Make masks of a capture's photos, and write them to its folder `masks`.
 
-    `changes` set the box about the object. `model` is an ONNX file that judges pixels in place of their colours. With `once`, a capture in
-    which some photos have masks is left as it is, as by a training.
+    `changes` set the box around the object. `model` is an ONNX file that finds the object's pixels; without a model, the pixels' colours
+    tell. With `once`, a capture with a mask for any photo is left as it is. A training does the same.
     """
     from refgs.capture import read_capture
     from refgs.capture.masks import make_masks
@@ -126,9 +126,9 @@ def train(asked: Asked, once: bool = False) -> None:
     """Train on a capture and write a run folder, or resume the training in it.
 
     Ctrl-C ends the training with a checkpoint, from which it can be resumed. A second Ctrl-C ends it at once. SIGTERM ends it with a
-    checkpoint if that takes no longer than CHECKPOINT_BY; otherwise the last one counts.
+    checkpoint if that takes no longer than CHECKPOINT_BY; otherwise the training resumes from the checkpoint before.
 
-    With `once`, the training is started, or resumed, or left as it is if it has ended. It must be asked for as it was before.
+    With `once`, the training is started, or resumed, or left as it is if it has ended. `asked` must then be the same as in the first call.
     """
     if once:
         left = train_job.unfinished(asked)
@@ -161,9 +161,10 @@ def train(asked: Asked, once: bool = False) -> None:
 
 @contextmanager
 def _signals_to_stop(repeat: float | None = CHECKPOINT_BY, end: float = END_BY) -> Iterator[list[int]]:
-    """Collect the signals SIGINT and SIGTERM of a `with` block in a list, which is yielded. A second one ends the block at once.
+    """Yield a list in which the signals SIGINT and SIGTERM of a `with` block are collected. A second signal ends the block at once.
 
-    SIGTERM counts as a second one after `repeat` seconds, unless that is None. After `end` seconds the process ends, whatever it does.
+    After a SIGTERM, a second one follows by itself in `repeat` seconds, unless `repeat` is None. After `end` seconds the process ends in
+    any case.
     """
     stopped, timers = [], []
 
@@ -192,7 +193,7 @@ def _signals_to_stop(repeat: float | None = CHECKPOINT_BY, end: float = END_BY) 
 
 
 def _end(signals: list[int]) -> None:
-    """End the process as the first of these signals does, or as Ctrl-C if there is none."""
+    """End the process: with the status TRY_AGAIN if the first of `signals` is SIGTERM, otherwise with KeyboardInterrupt, as Ctrl-C does."""
     if signals and signals[0] == signal.SIGTERM:
         sys.exit(TRY_AGAIN)
     raise KeyboardInterrupt
@@ -311,7 +312,7 @@ def export(
     overwrite: bool = False,
     once: bool = False,
 ) -> None:
-    """Export a run as a textured mesh or as splats, and print the files written. With `once`, files that all exist are left as they are."""
+    """Export a run as a textured mesh or as splats, and print the files written. With `once`, nothing is written if all files exist."""
     if once:
         files = [file for file in (mesh_file, splats_file, display_file) if file] or [folder / "mesh.glb"]
         if all(file.exists() for file in files):  # textures, written before the mesh, may be those of a killed process

@@ -26,7 +26,7 @@ class InputError(Exception):
 
 
 class TryAgain(InputError):
-    """Error that is not the input's fault: a full disk, a card that fails, a run that another process works in.
+    """Error that is not the input's fault: the disk is full, a card fails, or another process is using the run.
 
     The same command may succeed later. The command line exits with the status TRY_AGAIN.
     """
@@ -41,5 +41,5 @@ class InputWarning(UserWarning):
 
 
 def reason(error: Exception) -> str:
-    """Return what another library's error says, short enough to be quoted in a message. Its type's name if it says nothing."""
+    """Return another library's error message, short enough to be quoted in ours. If it is empty, return the name of the error's type."""
     return " ".join(str(error).split())[:120] or type(error).__name__

@@ -23,9 +23,9 @@ class _Section(BaseModel):
 
 
 class RegionSettings(_Section):
-    """Wanted part of a capture, as a box, and its up direction.
+    """Box around the wanted part of a capture, and the result's up direction.
 
-    Both are in the frame of the cameras.json of a run without them (docs/run-folder.md).
+    Both are in the frame of the cameras.json that a run without a box and up direction writes (docs/run-folder.md).
     """
 
     centre: Vector = Field(description="centre of the box")
@@ -161,7 +161,7 @@ class IndirectSettings(_Section):
 
 
 class ResidualSettings(_Section):
-    """Colour by direction that adds what material and light do not explain, sRGB-encoded. Dropped under another light."""
+    """View-dependent colour, sRGB-encoded, added for what material and light do not explain. Left out under another light."""
 
     start: float = Field(
         gt=0, le=1, description="start, a part of the training; material and light are frozen from then on. 1: never"

@@ -131,7 +131,7 @@ CLOSED = None  # queued in place of a command: the input has ended
 
 @dataclass
 class Refused:
-    """Line of the input that is no command. `job` is the job that it asks for, None if it asks for none. `what` says what is wrong."""
+    """Line of the input that is no valid command. `job` is the job that the line asks for, or None. `what` says what is wrong."""
 
     job: str | None
     what: str
@@ -210,7 +210,7 @@ class Worker:
         """Write an event to the output as a JSON line.
 
         If writing fails because nobody reads the output any more, act as if the input had ended. After a `Keep` command with `on` = True,
-        ignore the failure instead, so that jobs continue. The message `what` is written as one line.
+        ignore the failure instead, so that jobs continue. A message in `facts["what"]` is made one line.
         """
         if "what" in facts:
             facts = facts | {"what": one_line(facts["what"])}
@@ -291,7 +291,7 @@ class Worker:
         return "done", facts | {"psnr": quality, "left_out": left_out}
 
     def _hear_training(self, event: str, facts: dict[str, Any]) -> None:
-        """Send an event of a training. While it makes masks, also handle commands: it has no iterations yet that could."""
+        """Send an event of a training. While it makes masks, also handle commands here: later, each iteration does."""
         self.send(event, facts)
         while event == "progress" and "stage" in facts and not self._commands.empty():
             command = self._commands.get()

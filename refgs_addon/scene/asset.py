@@ -12,9 +12,9 @@ SIDE = 256  # pixels of the picture
 
 
 def mark_asset(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
-    """Mark a run's collection as an asset. Its picture is how the scene's camera sees the run alone, under the scene's light.
+    """Mark a run's collection as an asset. Its picture shows the run alone, from the scene's camera and in the scene's light.
 
-    Raises InputError if there is no camera.
+    Without a scene camera, the first camera of the run is used. Raises InputError if there is no camera.
     """
     own = cameras(collection)
     camera = scene.camera or next(iter(own.objects if own else ()), None)

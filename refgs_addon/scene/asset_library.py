@@ -34,8 +34,8 @@ def library_name(folder: Path) -> str:
 def import_as_assets(folder: Path) -> jobs.Job:
     """Start a job that makes each finished run of a batch an asset, and then lists the library in Blender's preferences.
 
-    Files that are in the library already stay as they are. Another Blender process does it, so that the open file stays as it is. Raises
-    InputError if there is no run to import, or if this is being done already.
+    Files that are in the library already stay as they are. Another Blender process makes the assets, so that the open file is not touched.
+    Raises InputError if no run is left to import, or if a job for this batch is already running.
     """
     from .render_process import start_blender
 

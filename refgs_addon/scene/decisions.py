@@ -13,10 +13,10 @@ ON_OFF = ("on", "off")  # words of the trainer's settings [needs]
 
 @dataclass(frozen=True)
 class Decision:
-    """Store a decision that the trainer wrote to a run's needs.json, docs/run-folder.md.
+    """Store one decision from a run's needs.json (docs/run-folder.md).
 
-    `needed` is the answer. `pictures` maps "on", "off" and "photo" to files, all of the view `view`. `psnr` maps "on" and "off" to the PSNR
-    of the two pictures against the photo, in dB.
+    `needed` is the decision: whether the scene needs the optional part of the training. `pictures` maps "on", "off" and "photo" to files;
+    all show the view `view`. `psnr` maps "on" and "off" to the PSNR of these pictures against the photo, in dB.
     """
 
     need: str
@@ -40,7 +40,7 @@ _read: dict[Path, tuple[int, list[Decision]]] = {}  # by needs.json: when it was
 
 
 def decisions(folder: Path) -> list[Decision]:
-    """List the decisions of a run that have pictures, also while it is trained. A file that is absent or broken has none."""
+    """List the decisions of a run that have pictures, also during its training. The list is empty if needs.json is missing or broken."""
     file = folder / "needs.json"
     try:
         written = file.stat().st_mtime_ns
@@ -74,7 +74,7 @@ def _parse(folder: Path, file: Path) -> list[Decision]:
 
 
 def find_decision(folder: Path, need: str) -> Decision:
-    """Find a run's decision about a need. Raises InputError if it has none with pictures."""
+    """Find a run's decision about an optional part of the training, `need`. Raises InputError if no such decision has pictures."""
     for decision in decisions(folder):
         if decision.need == need:
             return decision
@@ -89,7 +89,7 @@ def open_decisions(scene: bpy.types.Scene, folder: Path) -> list[Decision]:
 
 
 def confirm(scene: bpy.types.Scene, folder: Path, need: str) -> None:
-    """Note that the artist keeps a decision of a run in the scene's list: `open_decisions` no longer lists it."""
+    """Note in the scene's list of runs that the artist keeps a run's decision. `open_decisions` no longer lists this decision."""
     decision = find_decision(folder, need)
     for known in scene.refgs.runs:
         if Path(known.folder) == folder:

@@ -25,7 +25,7 @@ DARK = 0.02  # a darker base colour does not reveal how much light falls on it
 def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
     """Return the splats' materials after all edits: base_color (N, 3) linear Rec.709, metallic (N,), roughness (N,).
 
-    N is the number of splats that were not deleted. `row` (N,) says where each was among all splats.
+    N is the number of splats that were not deleted. `row` (N,) is each one's number among all splats, before any was deleted.
     """
     drawing = splats.modifiers[SPLATS]
     before = drawing.show_viewport, splats.hide_viewport, splats.hide_get()

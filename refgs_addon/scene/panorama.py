@@ -37,14 +37,14 @@ def best_rotation(image: bpy.types.Image, other: bpy.types.Image) -> tuple[float
 
 
 def diffuse_light(image: bpy.types.Image, rotation: Sequence[float]) -> tuple[np.ndarray, float]:
-    """Compute a panorama's diffuse light for `nodes.world_diffuse.set_harmonics`, and the window by which Eevee weakens its own.
+    """Compute a panorama's diffuse light for `nodes.world_diffuse.set_harmonics`, and Eevee's window.
 
     The light is the irradiance over π, as spherical harmonics (9, 3). `rotation` rotates the environment: Euler angles in radians.
 
-    The window is the factor, at most 1, by which Eevee weakens the second band. Until Blender 5.0, it makes the band's largest component as
-    large as the first band. From 5.1 on, it makes the band's vector three quarters as long as the first band. The colour that needs the
-    smallest factor counts. The factor computed here is right to 0.02, as measured on spheres in 4.3, 4.5, 5.0, 5.1, 5.2 and 5.3, under five
-    panoramas each.
+    The window is the factor, at most 1, by which Eevee weakens the second band of its own diffuse light. Until Blender 5.0, it makes the
+    band's largest component as large as the first band. From 5.1 on, it makes the band's vector three quarters as long as the first band.
+    Of the three colours, the one that needs the smallest factor decides. The window computed here is right to 0.02, as measured on spheres
+    in 4.3, 4.5, 5.0, 5.1, 5.2 and 5.3, under five panoramas each.
     """
     light = _reduced(image)
     height, azimuth = (

@@ -8,10 +8,10 @@ BASE, PER_PIXEL, PER_SURFEL = 0.85e9, 850.0, 5000.0  # bytes: libraries; of a ph
 
 
 def memory(settings: Settings) -> int:
-    """Estimate the bytes that a training takes at most, in the machine's memory, or about as much in a card's."""
+    """Estimate the most memory in bytes that a training takes. A card needs about as much as the machine's main memory."""
     return int(BASE + PER_PIXEL * settings.image.max_side**2 + PER_SURFEL * settings.surfels.budget)
 
 
 def card_share(settings: Settings, card: int) -> float:
-    """Return the part of a card of `card` bytes that a training takes, 0.01 … 1. Ray counts cards in such parts."""
+    """Return the fraction of a card's `card` bytes that a training takes, 0.01 … 1. Ray shares cards by such fractions."""
     return round(min(max(memory(settings) / card, 0.01), 1.0), 2)

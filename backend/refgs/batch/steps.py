@@ -24,8 +24,9 @@ FAILED = (1, 2)  # exit statuses after which a retry is useless
 class Step(NamedTuple):
     """Describe a step: its `name`, such as "train", the `run` it belongs to, and the `words` of its command after `refgs`.
 
-    `log` is the file for what it prints; the record is beside it. `made` is a file that is there once it is done, if there is one. `reads`
-    and `writes` are the files and folders that it works with; the log's is written.
+    The command's output is written to the file `log`; the record of the step lies beside it. `made`, if not None, is a file that exists
+    once the step is done. `reads` and `writes` are the files and folders that the step reads and writes. The folder of `log` is among
+    `writes`.
     """
 
     name: str
@@ -59,7 +60,7 @@ class TryLater(Exception):
 
 
 def recorded(step: Step) -> Outcome | None:
-    """Return the outcome of a step that was done before. Return None if it was not done, or if its command was different."""
+    """Return the outcome of a step that succeeded before. Return None if its command has changed or its result `made` is missing."""
     from refgs.formats.progress import Record
     from refgs.formats.validate import read_json
 
@@ -75,11 +76,12 @@ def recorded(step: Step) -> Outcome | None:
 def run_step(step: Step, cores: int, pause: float, depot: Any, optional: tuple[bool, ...], *before: Outcome) -> Outcome:
     """Run a step and record its outcome beside its log. A step that follows a failed one is not run.
 
-    `cores` is the number of threads. `depot` has the files, if this may be another machine than the batch's; otherwise it is None. `before`
-    are the outcomes of the steps that it follows, and `optional` says which of these may fail.
+    `cores` is the number of threads. `depot` gives access to the files of the batch's machine if the step may run on another machine;
+    otherwise it is None. `before` are the outcomes of the steps that this step follows. `optional` tells for each outcome whether a failure
+    is allowed.
 
-    If the command says that it may succeed later, if it was killed, or if the log or the record cannot be written, wait `pause` seconds and
-    raise TryLater.
+    Wait `pause` seconds and raise TryLater in three cases: the command says that it may succeed later, the command was killed, or the log
+    or the record cannot be written.
     """
     if any(outcome.status != 0 and not may_fail for outcome, may_fail in zip(before, optional, strict=True)):
         return Outcome(None)
@@ -118,9 +120,10 @@ def _run_and_record(step: Step, cores: int) -> Outcome:
 
 
 def _call(step: Step, cores: int, log) -> tuple[int, str]:
-    """Run the command of a step. Return its exit status and its output. However this call ends, the command ends with it.
+    """Run the command of a step. Return its exit status and its output. The command never outlives this call.
 
-    The command ends when its input closes, which the system does if this process is killed.
+    The command ends when its input is closed. This call closes the input when it returns or raises; the system closes it if this process is
+    killed.
     """
     log.write(f"$ refgs {' '.join(step.words)}\n".encode())
     log.flush()

@@ -1,9 +1,9 @@
-"""Find the plane that an object stands on or hangs on, and learn its colours, so that it can be told from the object.
+"""Find the plane that an object stands or hangs on, and learn its colours, so that pixels of the plane can be told from the object's.
 
-The photos are warped onto the plane. Each texel gets the median of the photos that see it, because the object hides another part of the
-plane in each photo. A pixel is not plane if its colour is not the one that its texel predicts. This works even where object and plane share
-colours. Shadows that stand still are part of the texture. Things that move, such as reflections in a shiny floor, differ between photos, so
-that their texels are uncertain.
+The photos are warped onto the plane. Each texel gets the median of the photos that see it, because the object hides a different part of the
+plane in each photo. A pixel does not show the plane if its colour is not the colour that the texel predicts. This works even where the
+object and the plane have the same colours. Shadows that do not move are part of the texture. Things that move, such as reflections in a
+shiny floor, differ between photos. So the colours of their texels count as uncertain.
 """
 
 from dataclasses import dataclass
@@ -46,10 +46,10 @@ class Plane:
 def find_plane(
     points: np.ndarray, centre: np.ndarray, radius: float, up: np.ndarray, positions: np.ndarray
 ) -> Plane | None:
-    """Find the plane that carries the object: a floor or a wall with many structure-from-motion points, and hardly any behind.
+    """Find the plane that carries the object: a floor or a wall. Many structure-from-motion points lie on it, and hardly any behind it.
 
-    `centre` and `radius` are a ball around the object, and `up` is the world's up direction. `positions` (N, 3) are those of the cameras,
-    which all are on the object's side. Return None if there is no such plane.
+    `centre` and `radius` are those of a ball around the object, and `up` is the world's up direction. `positions` (N, 3) are the positions
+    of the cameras. The cameras are on the same side of the plane as the object. Return None if no plane fits.
     """
     near = points[np.linalg.norm(points - centre, axis=1) < 3 * radius]
     if len(near) < 50:
@@ -86,7 +86,7 @@ def find_plane(
 class Backdrop:
     """Hold the colours of a plane, and how much they differ between photos, on a square grid of SIDE² texels around the object.
 
-    Colours are logarithms of 8-bit values, in steps. So a photo's exposure and white balance are an offset for each channel.
+    Colours are logarithms of 8-bit values, multiplied by STEPS. Exposure and white balance of a photo add an offset to each channel.
     """
 
     def __init__(self, plane: Plane, centre: np.ndarray, radius: float):
@@ -100,7 +100,7 @@ class Backdrop:
         self.to_world[3, 2] = 1
 
     def before(self, points: np.ndarray) -> np.ndarray:
-        """Mark the points (N, 3) that lie in front of the plane, not in it."""
+        """Mark the points (N, 3) on the object's side of the plane. Points nearer than ABOVE radii count as part of the plane."""
         return self.plane.height(points) > ABOVE * self.radius
 
     def learn(self, images: list[np.ndarray], cameras: list[Camera], hidden: list[np.ndarray]) -> None:
@@ -134,11 +134,12 @@ class Backdrop:
     def likelihood(self, image: np.ndarray, camera: Camera, hidden: np.ndarray) -> np.ndarray:
         """Return how well each pixel's colour fits the bare plane, as float32 (H, W).
 
-        It is the probability that the plane has a colour in the pixel's cell of the colour space, which has the size BIN. Where the texel's
-        colour is not known, as below the object, it is instead the negative of the odds of object to plane. Where the photos do not show
-        the plane, it is NaN.
+        Where the texel's colour is known, the value is a probability: that the plane's colour lies in a cell of size BIN around the pixel's
+        colour. Where the texel's colour is not known, for example below the object, the value is negative: minus the odds that the pixel
+        shows the object rather than the plane. Where the photos do not show the plane, the value is NaN.
 
-        The photo's exposure and noise are measured on the pixels that are not `hidden`.
+        The photo's exposure and noise are measured on the pixels that are not `hidden`. If too few of them show the plane, all values are
+        NaN.
         """
         texel, meets = self._pixels_on(camera)
         known = meets & (remap(self.known.astype(np.uint8), texel, cv2.INTER_NEAREST) > 0)
@@ -160,7 +161,7 @@ class Backdrop:
         return np.where(known, np.minimum(result, 1), np.where(meets, -odds, np.float32(np.nan)))
 
     def _pixels_on(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return the texel at each pixel as a map for `remap` (H, W, 2), and where there is one (H, W)."""
+        """Return the texture position that each pixel shows, as a map for `remap` (H, W, 2), and which pixels (H, W) show the texture."""
         column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         ray = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones_like(row)], axis=-1)
         ray = ray @ camera.world_to_camera[:3, :3]
@@ -218,5 +219,5 @@ def _logarithm(image: np.ndarray) -> np.ndarray:
 
 
 def _lab(image: np.ndarray) -> np.ndarray:
-    """Convert float RGB of 0..255 to Lab with all channels on 8-bit scales."""
+    """Convert RGB, float32 0..255, to Lab, float32. L is scaled to 0..255, as in 8-bit Lab; a and b are as they are."""
     return cv2.cvtColor(image / 255, cv2.COLOR_RGB2LAB) * np.array([2.55, 1, 1], np.float32)

@@ -56,7 +56,7 @@ def make_masks(
 
     `wanted` may set a box around the object, as for `read_capture`. Its up direction is not used. Without a box, the object is guessed
     (`guess_box`), and the guess is reported as the event "region". `report(event, facts)` is also called with "progress" and "warning".
-    `model` is an ONNX file (`SalienceModel`) that finds the object's pixels. Without it, colours do.
+    `model` is an ONNX file (`SalienceModel`) that finds the object's pixels. Without a model, the pixels' colours tell where the object is.
 
     Returns a dict:
 
@@ -65,9 +65,9 @@ def make_masks(
     - `region`: the box around them, as settings for a training with the new masks.
     - `moved`: the matrix (4, 4), as a list, by which the new masks move the capture's frame: p_new = moved @ p.
 
-    All masks are written together at the end. An interrupted call leaves the earlier masks. Raises InputError if the artist has made all
-    masks already, if the artist's masks are all white, if strokes or the model do not fit, or if nothing is found. Raises ReadOnlyError if
-    the folder cannot be written to.
+    All masks are written together at the end. An interrupted call leaves the earlier masks. Raises InputError if every photo already has a
+    mask by the artist, if the artist's masks are all white, if strokes or the model do not fit, or if nothing is found. Raises
+    ReadOnlyError if the folder cannot be written to.
     """
     return with_masks(read_files(folder), wanted, report, model)[1]
 
@@ -165,8 +165,9 @@ def with_masks(
 def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, float]:
     """Guess a box around the object: a cube around the point at which the cameras look.
 
-    `views` are the capture's views. The caller has removed the masks that it wants to ignore. Returns the box, the fraction of it that
-    the object is likely to fill, and the radius of the region of interest. Raises InputError if the cameras look outwards, as in a room.
+    `views` are the capture's views, without the masks that the caller wants to ignore. Returns the box, the fraction of the box's edges
+    that the object is likely to fill, and the radius of the region of interest. Raises InputError if the cameras look outwards, as in a
+    room.
     """
     found = find_region(views, up_direction(views), capture.points, [])
     if found.because == LOOK_OUT:
@@ -189,14 +190,14 @@ def region_settings(box: Box) -> list[str]:
 
 
 def moved_region(wanted: RegionSettings, moved: list[list[float]]) -> RegionSettings:
-    """Return a box in the frame that new masks have moved. `moved` (4, 4) is what `make_masks` returns."""
+    """Convert the box `wanted` to the capture's frame after new masks moved the frame. `moved` (4, 4) is `make_masks`'s result `moved`."""
     scale = sum(row[0] ** 2 for row in moved[:3]) ** 0.5
     centre = tuple(sum(a * b for a, b in zip(row, (*wanted.centre, 1.0), strict=True)) for row in moved[:3])
     return wanted.model_copy(update={"centre": centre, "size": tuple(scale * edge for edge in wanted.size)})
 
 
 def masks_folder(capture: Capture) -> Path:
-    """Return the folder into which a capture's masks are made. Raises InputError if its masks can only be in its photos."""
+    """Return the folder for a capture's masks. Raises InputError if its layout keeps masks elsewhere, as in alpha channels."""
     return _root(capture) / "masks"
 
 
@@ -238,7 +239,7 @@ def _inner(view: View, root: Path) -> Path:
 
 
 def _targets(root: Path, views: list[View]) -> dict[View, Path]:
-    """Return the mask file of each photo that has none yet. Photos that differ only in their suffix keep it, as in 1.jpg.png."""
+    """Return the mask file of each photo without a mask. Photos that differ only in their suffix keep it in the name, as in 1.jpg.png."""
     names = [_inner(view, root) for view in views]
     stems = Counter(name.with_suffix("") for name in names)
     files = (
@@ -260,7 +261,7 @@ def _hashes(root: Path) -> set[str]:
 
 
 def _choose(views: list[View], root: Path) -> list[View]:
-    """Choose the photos to carve by: some evenly spaced ones, and all for which there are masks or strokes by the artist."""
+    """Choose the photos that the object is carved from: some evenly spaced ones, and all that have a mask or strokes by the artist."""
     every = max(1, -(-len(views) // CARVED_BY))
     return [view for i, view in enumerate(views) if i % every == 0 or view.masked or _stroke_file(view, root)]
 
@@ -301,9 +302,9 @@ def _load(view: View, root: Path, side: int, judge: _Judge | None) -> Photo:
 
 
 def _read_strokes(file: Path, view: View, camera: Camera) -> np.ndarray:
-    """Read an artist's strokes as int8 (H, W): 1 is the object, −1 is not, 0 is unmarked.
+    """Read an artist's strokes as int8 (H, W): 1 marks the object, −1 the rest, 0 says nothing.
 
-    They are undistorted and resized to `camera`, as the photo is.
+    The strokes are undistorted and resized to `camera`, as the photo is. Raises InputError if they have another shape or no transparency.
     """
     color, alpha = read_image(file)
     height, width = color.shape[:2]
@@ -348,7 +349,10 @@ def _to_photo(view: View, mask: np.ndarray) -> np.ndarray:
 
 
 def _put(files: dict[Path, Path], root: Path, before: set[str]) -> None:
-    """Move the new masks to their places, and note their hashes. They are noted first, so that no mask is ever taken for the artist's."""
+    """Move new masks to their places: `files` maps temporary paths to final paths. `before` are the hashes of earlier masks.
+
+    The hashes of the new masks are stored before the masks are moved, so that none of them is ever taken for the artist's.
+    """
     (root / "masks").mkdir(exist_ok=True)
     now = {_hash(path) for path in files}
     write_text(root / "masks" / MADE, json.dumps(sorted(before | now)))

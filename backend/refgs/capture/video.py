@@ -44,15 +44,15 @@ def extract_photos(
     """Choose up to `count` frames of a video and write them to `out`/images as JPEG files frame_0001.jpg, frame_0002.jpg …
 
     The video's time is divided into `count` equal stretches. The sharpest frame of each stretch is taken. It is left out if it is blurred
-    beside those of the neighbouring stretches, or if the camera has not moved since the last photo. Photos are upright, as players show the
-    video. HDR is converted to sRGB.
+    compared with the frames of the neighbouring stretches, or if the camera has not moved since the last photo. Photos are upright, as
+    players show the video. HDR is converted to sRGB.
 
-    One frame in full size is kept in memory, and a small grey picture a stretch. `report("progress", facts)` is called after each frame:
-    `done` of `total` frames are read, and of the stretches so far `kept` and `blurred`. Returns the counts `frames`, `photos`, `blurred`
-    and `duplicates`.
+    Memory holds one full-size frame, and a small grey picture for each stretch. `report("progress", facts)` is called after each frame. The
+    facts are counts: `done` frames of `total` are read, and of the stretches read so far, `kept` are kept and `blurred` are blurred.
+    Returns the counts `frames`, `photos`, `blurred` and `duplicates`.
 
-    Raises InputError, and leaves nothing behind, if `out`/images exists, if the file is not a video or is truncated, or if fewer than
-    three photos remain.
+    Raises InputError, and leaves nothing behind, if `out`/images exists, if the file is not a video or is truncated, or if fewer than three
+    photos remain.
     """
     video, out = Path(video), Path(out)
     images, work = out / "images", out / "images.tmp"
@@ -87,9 +87,9 @@ def extract_photos(
 def sharpness(grey: np.ndarray) -> float:
     """Measure how sharp a grey picture (h, w) is. The result is 0 for a uniform picture and does not depend on contrast.
 
-    It is the sum of squared second derivatives divided by the sum of squared first derivatives, in the direction in which this is least:
-    motion blurs in one direction only. Sharp texture (power spectrum 1/f²) has 0.4. Blurred with a standard deviation of 1, 2 or 3 pixels
-    it has 0.26, 0.13 or 0.07. Sharp edges have half as much.
+    The measure is the sum of squared second derivatives divided by the sum of squared first derivatives. The direction with the smallest
+    ratio counts, because motion blurs in one direction only. A sharp texture (power spectrum 1/f²) gives 0.4. Blurred with a standard
+    deviation of 1, 2 or 3 pixels, it gives 0.26, 0.13 or 0.07. Sharp edges give half as much as sharp texture.
     """
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)  # else a dark frame's noise counts as sharp detail
     across, down = _gradient(smooth)
@@ -108,8 +108,9 @@ def sharpness(grey: np.ndarray) -> float:
 def movement(before: np.ndarray, after: np.ndarray) -> float:
     """Measure how far the picture moved between two grey pictures (h, w) uint8, as a fraction of the longer side.
 
-    Corners are tracked by the method of Lucas and Kanade. The result is the distance that 90 % of them do not exceed, so that an object on
-    a turntable counts in front of still surroundings. It is infinite if there are no corners, or if a tenth of them is lost.
+    Corners are tracked by the method of Lucas and Kanade. The result is the distance that 90 % of the corners do not exceed. So the motion
+    of an object on a turntable counts, even though its surroundings stand still. The result is infinite if the picture has no corners, or
+    if a tenth of them is lost.
     """
     corners = cv2.goodFeaturesToTrack(before, 400, 0.01, 5)
     if corners is None:
@@ -127,7 +128,7 @@ def _gradient(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _products(*pictures: np.ndarray) -> np.ndarray:
-    """Return the scalar products of every two pictures, as a matrix. They give the squares' sum of any weighted sum of the pictures."""
+    """Return the scalar products of every two pictures, as a matrix M. A weighted sum of the pictures has the sum of squares w·M·w."""
     return np.array([[np.vdot(one, other) for other in pictures] for one in pictures], np.float64)
 
 
@@ -222,7 +223,7 @@ def _sharpest(
 
 
 def _sharp(candidates: list[_Candidate]) -> list[_Candidate]:
-    """Leave out the candidates that are blurred beside those of the neighbouring stretches."""
+    """Leave out the candidates that are blurred compared with those of the neighbouring stretches."""
     measured = np.array([candidate.sharpness for candidate in candidates])
     reach = max(2, len(candidates) // 10)
     usual = [np.median(measured[max(0, i - reach) : i + reach + 1]) for i in range(len(measured))]
@@ -234,9 +235,10 @@ def _sharp(candidates: list[_Candidate]) -> list[_Candidate]:
 
 
 def _choose(video: Path, frames: int, candidates: list[_Candidate]) -> tuple[list[_Candidate], int, int]:
-    """Leave out candidates that are blurred, and those between which the camera did not move.
+    """Leave out blurred candidates and duplicates. A duplicate shows hardly any camera motion since the last candidate kept.
 
-    Returns the others, the number of blurred ones and the number of duplicates. Raises InputError if fewer than MIN_PHOTOS are left.
+    Returns the kept candidates, the number of blurred ones and the number of duplicates. Raises InputError if fewer than MIN_PHOTOS are
+    left.
     """
     if len(candidates) < MIN_PHOTOS:
         raise InputError(f"{video}: too few frames in it ({frames}). {REFILM}.")

@@ -12,9 +12,9 @@ Seconds = Annotated[Finite, Field(ge=0)]
 
 
 class Facts(Model):
-    """Hold what a checkpoint knows besides its tensors.
+    """Hold everything in a checkpoint except its tensors.
 
-    `parts` are the facts of each part of the training that remembers something, by its name. `clock` are seconds by part of an iteration.
+    `parts` maps the name of each stateful part of the training to its facts. `clock` maps each timed part of an iteration to its seconds.
     """
 
     iteration: Count

@@ -72,7 +72,7 @@ def read_mesh(path: str | os.PathLike) -> Mesh:
 
 
 def check_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
-    """Raise InputError, which names the file `path`, if a mesh has no faces, vertices that are not finite, or faces of other vertices."""
+    """Raise InputError naming the file `path` if a mesh has no faces, vertices that are not finite, or vertex indices out of range."""
     vertices, faces = mesh.vertices, mesh.faces
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise InputError(f"{path} has no triangles: write it again")

@@ -13,19 +13,19 @@ class _Figures(RootModel[dict[str, JsonValue]]):
 
 
 class Said(Model):
-    """Hold a sentence for the user about a measurement, if there is one."""
+    """Hold the result of a measurement as a sentence for the user, or None if there is nothing to say."""
 
     what: str | None = None
 
 
 class Metrics(Model):
-    """Hold what metrics.json has besides figures: `ambiguities` and `doubt` are what photos cannot tell apart."""
+    """Hold the sentences of metrics.json: `ambiguities` between light and materials, and `doubt` between metal and paint."""
 
     ambiguities: dict[str, Said] = Field(default_factory=dict)
     doubt: Said | None = None
 
     def said(self) -> list[str]:
-        """Return the sentences about what photos cannot tell apart: changes to the scene, and metal from paint."""
+        """Return the sentences about what photos cannot tell apart: `ambiguities` first, then `doubt`."""
         return [about.what for about in (*self.ambiguities.values(), self.doubt) if about and about.what]
 
 

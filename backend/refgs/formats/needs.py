@@ -20,7 +20,7 @@ Inside = Annotated[str, AfterValidator(_inside)]
 
 
 class Pictures(Model):
-    """Name the pictures with and without a part, which are files in the run folder, and the photo. PSNRs are in dB."""
+    """Name pictures of a view, as paths in the run folder: with an optional part (`on`), without it (`off`), and the photo. PSNR in dB."""
 
     on: Inside
     off: Inside
@@ -35,7 +35,7 @@ class Found(Model):
 
     `statistic` was compared with `threshold`. Leaving the part out saves `seconds` and `megabytes`, and costs `decibels` of PSNR on the
     training views. `side` is the reduced resolution for the part `light`, `total` the reduced number of iterations for `iterations`.
-    `again` is the value that the second look at a matte scene measured.
+    `again` is set for a scene taken for matte: it is how much colours change with the view, measured once more halfway.
     """
 
     needed: bool
@@ -52,7 +52,7 @@ class Found(Model):
 
 
 class Row(Model):
-    """Hold one part of the training, `why` it was kept or left out, and in words what leaving it out saved and cost."""
+    """Hold a row of needs.json: an optional part (`what`), `why` it was kept or left out, what leaving it out `saved`, and its `cost`."""
 
     model_config = ConfigDict(extra="allow")  # the figures behind the words
 
@@ -66,7 +66,7 @@ class Row(Model):
     @field_validator("pictures", mode="wrap")
     @classmethod
     def _whole(cls, value: Any, handler: Any) -> Pictures | None:
-        """Leave out incomplete pictures, because a row is useful without them."""
+        """Return None for incomplete pictures, instead of an error: the row is useful without pictures."""
         try:
             return handler(value)
         except ValidationError:

@@ -81,7 +81,7 @@ def validated(data: Any, model: type[M], source: str, again: str) -> M:
 
 
 def _place(error: Any, data: Any) -> tuple[list[str], str]:
-    """Describe where a field is: the frame whose `file_path` is above it, if there is one, and the field's keys joined by dots."""
+    """Describe where a field is. Return the frame that holds it, as a list of one text or none, and its keys joined by dots."""
     where, keys = [], []
     for part in error["loc"]:
         known = range(len(data)) if isinstance(data, list) else data if isinstance(data, dict) else ()

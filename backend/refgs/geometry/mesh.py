@@ -16,9 +16,9 @@ def clean(mesh: Mesh, triangles: int) -> SmoothMesh:
     """Clean up a mesh, simplify it to about `triangles` faces if it has more, and compute smooth normals.
 
     - Crumbs are removed: connected parts with less than KEEP times the largest part's area.
-    - Holes of at most HOLE edges are closed. Objects have none: no photo shows the surface there.
-    - Frays are removed: strips at a border of the surface in which no vertex is FRAY faces away from the border. A closed surface has no
-      border, however thin it is.
+    - Holes of at most HOLE edges are closed. Real objects have no such holes: they are gaps where no photo shows the surface.
+    - Frays are removed: strips along a border that are so narrow that none of their vertices is FRAY faces away from the border. A closed
+      surface has no border, however thin it is.
 
     Simplification is by quadric error (Garland and Heckbert 1997). In the returned mesh, no edge has more than two faces. Faces keep their
     winding. Raises InputError if the mesh has no valid face.
@@ -84,8 +84,8 @@ def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def _untrimmed(mesh: trimesh.Trimesh) -> np.ndarray:
     """Mark the faces (F,) that belong neither to crumbs nor to frays, as `clean` defines them.
 
-    This is a morphological opening of the surface. FRAY rings of faces are removed along its borders, then the crumbs that this makes. What
-    remains grows by as many rings. Surfaces fray where photos end, because few photos tell what is there.
+    This is a morphological opening of the surface. FRAY rings of faces are removed along the borders. The pieces that have become crumbs
+    are removed too. What remains grows back by FRAY rings. Surfaces fray where photos end, because few photos show what is there.
     """
     border = np.zeros(len(mesh.vertices), bool)
     border[_border(mesh)] = True
@@ -99,7 +99,7 @@ def _untrimmed(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def _border(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Return the edges (B, 2) of one face only, as vertex numbers in the face's winding."""
+    """Return the edges (B, 2) that belong to only one face, as vertex numbers in the face's winding."""
     _, edge, faces = np.unique(mesh.edges_sorted, axis=0, return_inverse=True, return_counts=True)
     return mesh.edges[faces[edge.reshape(-1)] == 1]
 

@@ -28,7 +28,7 @@ _Work = struct("Adam", "adam.cpp")
 
 @dataclass
 class Moments:
-    """Hold Adam's moments of a tensor: the running `mean` of its gradient and of the gradient's `square`, after so many `steps`."""
+    """Hold Adam's moments of a tensor: running means of its gradient (`mean`) and of the gradient's `square`, and the number of `steps`."""
 
     steps: int
     mean: Tensor
@@ -39,8 +39,8 @@ class Learned(Mapping[str, Tensor]):
     """Hold the tensors that a training learns, by name, with Adam's moments, learning rates and limits.
 
     A tensor is by row if it has one row for each surfel. The rows of all such tensors are replaced together (see `rows`). A tensor by row
-    that gets no gradient, such as a mask, is replaced with them, but Adam does not change it. `constant` holds the tensors that no longer
-    learn, each with one row for all surfels.
+    may get no gradient, such as a mask: its rows are replaced as well, but Adam does not change it. `constant` holds the tensors that no
+    longer learn, each with one row for all surfels.
 
     One kernel updates all tensors with Adam (Kingma and Ba 2015). Elements whose gradient is zero keep their value and their moments. So a
     surfel that is not visible does not move. In the original Adam it would still move, because its moments decay slowly.
@@ -116,9 +116,9 @@ class Learned(Mapping[str, Tensor]):
     def rows(self, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
         """Rebuild all surfels from the rows `index` of their tensors. A row may be taken more than once.
 
-        Each row keeps its moments, except that rows of the result with an index in `fresh` start with zero moments. Adam then moves these
-        rows faster than others at first. Pictures get worse for a while, but for captures without masks, the final result is better. If
-        memory runs out, all surfels stay as they were.
+        Rows keep their moments. Rows of the result whose indices are in `fresh` are an exception: their moments start at zero. Adam then
+        moves these rows faster than others at first. Pictures get worse for a while, but for captures without masks, the final result is
+        better. If memory runs out, all surfels stay as they were.
         """
         values = {name: _leaf(value.detach()[index]) for name, value in self.by_row.items()}
         moments = {}
@@ -203,11 +203,11 @@ class Learned(Mapping[str, Tensor]):
         return tensors
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over a checkpoint's values of the tensors that are learned or constant here.
+        """Take over a checkpoint's values of the tensors that are learned or constant now.
 
-        A parameter may have been left out, or brought back, after the checkpoint was written. If it is constant there and learned here, its
-        one row is repeated for all surfels. If it is learned there and constant here, its first row is taken. A learned tensor that is not
-        by row is dropped if the checkpoint lacks it. Raises KeyError if any other tensor is missing.
+        A parameter may have been left out, or brought back, after the checkpoint was written. If a parameter is constant in the checkpoint
+        and learned now, its one row is repeated for all surfels. If it is learned in the checkpoint and constant now, its first row is
+        taken. A learned tensor that is not by row is dropped if the checkpoint lacks it. Raises KeyError if any other tensor is missing.
         """
         rows = len(tensors["parameter.position"])
         self.moments.clear()

@@ -23,15 +23,16 @@ Progress = Callable[[int, int], None]
 def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress: Progress) -> np.ndarray:
     """Composite the splats at points (N, 3) on a surface with unit normals (N, 3).
 
-    Returns (N, 8): base colour, metallic, roughness, unit normal; (N, 9) with the doubt, if the splats have one.
+    Returns (N, 8): base colour, metallic, roughness, unit normal. If the splats have a doubt (how little photos tell metal from paint), it
+    follows as a ninth column.
 
     At each point a ray looks at the surface from outside, along the reversed normal. Splats are composited front to back if they are near
     the surface and face outwards. A splat's alpha is its opacity times its Gaussian where the ray meets the splat's plane. The result is
     divided by the sum of the weights. If no splat meets the ray, the nearest splats give the values.
 
-    The blended normal belongs to the mean position of the splats, not to the point. So the change of the normals with position is fitted to
-    the splats by weighted least squares, and the blended normal is corrected by it. `progress` is called with the number of points done and
-    their total.
+    The blended normal belongs to the mean position of the splats, not to the point. So weighted least squares fit how the splats' normals
+    change with position. The change from the mean position to the point is added to the blended normal. `progress` is called with the
+    number of points done and their total.
     """
     table, values = _geometry(splats), _appearance(splats)
     spread = float(np.median(splats.scales[:, :2].mean(axis=1))) or 1.0
@@ -58,8 +59,8 @@ def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress:
 def blended_normals(splats: Splats) -> np.ndarray:
     """Compute the unit normal (N, 3) of the surface at each splat: `composite` at the splats' positions.
 
-    The learned normals of splats that share a pixel differ by 16° to 24°, though their blend is right to a degree or two. Programs that
-    shade each splat by itself, as Blender does, need the blend. Where it lies beyond the splat's plane, the splat's own normal is returned.
+    The learned normals of splats that share a pixel differ by 16° to 24°, but their blend is right to a degree or two. Programs that shade
+    each splat by itself, as Blender does, need the blend. A splat keeps its own normal if the blend points to the back of its plane.
     """
     own = _outward(splats)
     blended = composite(splats, splats.positions, own, lambda done, total: None)[:, NORMAL]
@@ -67,7 +68,7 @@ def blended_normals(splats: Splats) -> np.ndarray:
 
 
 def _outward(splats: Splats) -> np.ndarray:
-    """Return the normals (N, 3) of the splats' planes, as learned, to the side of `splats.normals`."""
+    """Return the learned normals (N, 3) of the splats' planes, each flipped to the side to which `splats.normals` points."""
     plane = axes(torch.from_numpy(splats.rotations))[2].numpy()
     return np.where((plane * splats.normals).sum(axis=1, keepdims=True) < 0, -plane, plane)
 

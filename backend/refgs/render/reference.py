@@ -42,7 +42,7 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rasterise float64 tensors as `refgs.render.rasterize.rasterize` does. Returns features, depth, alpha, and a margin (H, W).
 
-    Depth only counts the surfels that `trimmed_depth` averages between `upper` and `lower`.
+    Depth counts only the share of each surfel's weight that lies between the transmittances `upper` and `lower` (see `trimmed_depth`).
 
     A pixel depends on comparisons with thresholds, such as the least alpha. The margin is the smallest relative distance from any of these
     thresholds. Where it is tiny, a rounding error can change the pixel.
@@ -264,8 +264,8 @@ def _cube_margins(directions: Tensor, sides: list[Tensor], margins: list) -> Non
 def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor, margins: list) -> Tensor:
     """Look up the prefiltered light (P, 3) in unit directions (P, 3) for roughnesses (P,).
 
-    `levels` are what `prefilter` returns, with the sides `sides`. Distances from jumps of the derivatives are appended to `margins` (see
-    `shade`).
+    `levels` and `sides` are those of the prefiltered light in `shade`. Distances from jumps of the derivatives are appended to `margins`
+    (see `shade`).
     """
     known, alpha = torch.tensor(prefilter.ROUGHNESS, dtype=roughness.dtype), roughness**2
     interval = (torch.bucketize(roughness.detach().contiguous(), known) - 1).clamp(0, len(known) - 2)

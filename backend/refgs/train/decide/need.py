@@ -44,10 +44,10 @@ class Decision(NamedTuple):
 class Given(NamedTuple):
     """Hold what the caller of `Need.measure` has measured.
 
-    - `done`: how many iterations are done.
-    - `hidden`: the fraction of the object's pixels that mirror the object.
-    - `common`: the common values of metallic and roughness, if nearly all surfels in `kept` share one: by name, the value and the range's
-      width.
+    - `done`: the number of iterations done.
+    - `hidden`: the fraction of the object's pixels in which the object mirrors itself.
+    - `common`: which of metallic and roughness nearly all compared surfels share. By name: (value, width of the range of values).
+    - `kept`: the number of surfels compared.
     """
 
     done: int = 0
@@ -89,7 +89,7 @@ class Need:
     def undo(self, state: State, why: str) -> None:
         """Bring this optional part of the training back, after `apply` has left it out. `why` is the reason, for the record.
 
-        Only parts whose decision can be taken back have this method. It may be called again.
+        Only parts whose decision can be taken back have this method. It may be called for a part that is back already.
         """
         raise NotImplementedError
 

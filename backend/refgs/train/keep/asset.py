@@ -35,8 +35,8 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
     """Write the results of a training into its run folder.
 
     These are the surfels (splats.ply), the light (environment.exr), and what the training left out (needs.json). With inter-reflection, the
-    object's mesh is written to occluder.ply. With learned exposures or poses, cameras.json is written again to include them. If photos
-    decide what is metal, splats.ply also has each surfel's doubt, and metrics.json has the fraction of the surface that is in doubt.
+    object's mesh is written to occluder.ply. With learned exposures or poses, cameras.json is written again to include them. If the
+    training tells metal from paint, splats.ply has each surfel's doubt, and metrics.json the fraction of the surface that is in doubt.
 
     A run that has splats.ply counts as finished. So this file is written last, after `before_splats` is called.
     """
@@ -105,7 +105,7 @@ REWRITES = (_without_unlearned, _without_untraced, _with_relightable_albedo)
 
 
 def _with_constants(surfels: Surfels, state: State, kept: Tensor) -> tuple[Surfels, dict[str, float]]:
-    """Set metallic, roughness and specular to one value for all surfels, if they are about the same. Return these values by name, too.
+    """Set each of metallic, roughness and specular to one value, if it is about the same for all surfels. Return these values by name, too.
 
     splats.ply then needs no column for them. Only surfels whose entry in `kept` (N,) is true are compared.
     """
@@ -144,7 +144,7 @@ def _write_refined_cameras(state: State) -> None:
 def _irradiance(surfels: Surfels, environment: Environment, state: State) -> Tensor:
     """Compute the irradiance of each surfel, divided by π (N, 3).
 
-    If the light turned with the camera, average over the photos. In each photo the surfel is lit on the side that faces the camera, and
+    If the light turns with the camera, average over the photos. In each photo the surfel is lit on the side that faces the camera, and
     photos that show the surfel at a grazing angle count less.
     """
     normals = surfels.normals()

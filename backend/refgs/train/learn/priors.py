@@ -1,8 +1,8 @@
 """Use normals and depth that other programs guessed from single photos, early in the training.
 
-Photos of mirrors and hollows can also be explained by wrong shapes, such as the visual hull's lid over a bowl. A network that guesses from
-one photo knows what bowls look like. Its guess is wrong in detail, and its depth has no scale. So these terms of the loss saturate, and
-fade to zero: in the end, only the photos count.
+Photos of mirrors and hollow shapes can also be explained by wrong shapes, such as the visual hull's lid over a bowl. A network that guesses
+from one photo knows what bowls look like. Its guess is wrong in detail, and its depth has no scale. So these loss terms saturate, and fade
+to zero: in the end, only the photos count.
 
 Programs write normals with different axes. The axes that agree best with the surfels at the start are used for all views. Depth is fitted
 to the rendered depth each time that it is used, with one scale and one shift per view.
@@ -58,7 +58,7 @@ class Priors(Part):
 def load(state: State) -> None:
     """Load the priors of the training views, and find out what they mean: the axes of normals, and whether depth is a disparity.
 
-    Priors are used only if all photos have masks. Without masks, no shape is known with which to compare them.
+    Priors are used only if all photos have masks. Without masks, there is no shape to compare the priors with.
     """
     given = {view.camera.name: view for view in state.capture.train_views if view.prior_normals or view.prior_depth}
     if state.settings.loss.prior == 0 or not given:
@@ -130,9 +130,9 @@ def depth_loss(
 
 
 def at_pixels(values: Tensor, camera: Camera, pixels: Camera) -> Tensor:
-    """Look up a map (H, W, …) of `camera` at the pixels of another camera, and take the nearest values.
+    """Look up a map (H, W, …) of `camera` at the pixels of the camera `pixels`, and take the nearest values.
 
-    That camera is in the same place. It may have another size, or be a crop.
+    Both cameras are in the same place and have the same rotation. They may differ in size and crop.
     """
     found = []
     for axis, (size, focal, centre) in enumerate((("height", "fy", "cy"), ("width", "fx", "cx"))):
@@ -145,8 +145,8 @@ def at_pixels(values: Tensor, camera: Camera, pixels: Camera) -> Tensor:
 def fitted(guessed: Tensor, depth: Tensor, counts: Tensor, disparity: bool, radius: float) -> tuple[Tensor, Tensor]:
     """Scale and shift guessed depth or disparity (H, W) to fit `depth` (H, W) best, by robust least squares.
 
-    Pixels are weighted by `counts`, and by less the farther they are from the fit (Cauchy's weights, at FAR scene radii). Returns the depth
-    (H, W), and a scalar: 1, or 0 if the guess falls where depth rises. Neither has gradients.
+    Pixels are weighted by `counts`, and by less the farther they are from the fit (Cauchy's weights, at FAR scene radii). Returns the
+    fitted depth (H, W), and a scalar: 1 if the guess rises with `depth` (a disparity: with 1 / depth), else 0. Neither has gradients.
     """
     wanted = 1 / depth.clamp_min(1e-6 * radius) if disparity else depth
     weight, found, slope = counts, depth, counts
@@ -163,11 +163,11 @@ def fitted(guessed: Tensor, depth: Tensor, counts: Tensor, disparity: bool, radi
 
 
 def axes_of(pairs: Iterable[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor | None, float]:
-    """Find the axes of guessed normals. Each of `pairs` has three sets of unit vectors (P, 3), all seen by one camera:
+    """Find the axes of guessed normals. Each of `pairs` has three sets of unit vectors (P, 3) for the view of one camera:
 
-    - those of the surface, in the camera's axes (x right, y down, z forward)
-    - the guessed ones, as they are in the file
-    - the guessed ones turned to the camera's axes, as if those in the file were in world space
+    - the surface's normals, in the camera's axes (x right, y down, z forward)
+    - the guessed normals, as they are in the file
+    - the guessed normals turned to the camera's axes, for the case that the file has them in world space
 
     Returns the signs (3,) by which to multiply the file's x, y and z, or None if the normals are in world space. The answer with the larger
     mean cosine is chosen. Also returns how well x and y agree then: the smaller of their correlations.
@@ -227,7 +227,7 @@ def _with_axes(state: State, normals: Maps) -> Maps:
 def _near_outline(photo: Photo) -> Tensor:
     """Tell which pixels (H, W) lie just inside the outline of a photo's mask.
 
-    There, the visual hull has the normals of the surface, even where its lid covers a bowl.
+    Just inside, the visual hull has the surface's normals, even if elsewhere its lid covers a bowl.
     """
     if photo.mask is None:
         return torch.zeros(photo.image.shape[:2], dtype=torch.bool, device=photo.image.device)
@@ -238,7 +238,7 @@ def _near_outline(photo: Photo) -> Tensor:
 
 
 def _with_kind(state: State, depth: Maps) -> tuple[Maps, bool]:
-    """Return the maps of depth, and whether they hold disparities. Drop all if they are unlike the depth of the first surfels.
+    """Return the maps of depth, and whether they hold disparities. Return no maps if they do not correlate with the first surfels' depth.
 
     Disparity falls where depth rises, so its correlation with depth is negative.
     """
