@@ -47,7 +47,7 @@ class Many(bpy.types.PropertyGroup):
 
 
 class BatchRow(bpy.types.PropertyGroup):
-    """Hold a row of a batch's table, as `scene.batch_table.Row` does. Blender files do not store it."""
+    """Hold a row of a batch's table, with the fields of `scene.batch_table.Row`. Rows are not saved in the .blend file."""
 
     name: StringProperty()
     state: StringProperty()

@@ -313,7 +313,7 @@ def export(
     overwrite: bool = False,
     once: bool = False,
 ) -> None:
-    """Export a run as a textured mesh or as splats, and print the files written. With `once`, files that all exist are left as they are."""
+    """Export a run as a textured mesh or as splats, and print the files written. With `once`, nothing is written if all files exist."""
     if once:
         files = [file for file in (mesh_file, splats_file, display_file) if file] or [folder / "mesh.glb"]
         if all(file.exists() for file in files):  # textures, written before the mesh, may be those of a killed process

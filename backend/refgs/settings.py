@@ -23,7 +23,7 @@ class _Section(BaseModel):
 
 
 class RegionSettings(_Section):
-    """Wanted part of a capture, as a box, and its up direction.
+    """Box around the wanted part of a capture, and the result's up direction.
 
     Both are in the frame of the cameras.json that a run without a region would write (docs/run-folder.md).
     """

@@ -12,8 +12,8 @@ _SAME = 1e-6  # farthest that a splat is from its own point, which is a copy of 
 def kept_tree() -> bpy.types.NodeTree:
     """Make the node tree `RefGS Kept`, or return the existing one, which all runs share.
 
-    It keeps a splat if the mesh of the object Points has a vertex at its position, in the objects' local coordinates. It keeps all splats
-    if there is no such mesh, or the mesh is empty.
+    The tree keeps a splat if the mesh of the object Points has a vertex at the splat's position, in the objects' local coordinates. It
+    keeps all splats if that mesh is missing or empty.
     """
     if NAME in bpy.data.node_groups:
         return bpy.data.node_groups[NAME]

@@ -57,7 +57,7 @@ def add_splats(
 def cloud_attributes(
     splats: dict[str, np.ndarray], normal_u: np.ndarray, normal_v: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return the attributes that a point cloud needs: the arrays of `read_splats`, and how the normal changes across each splat.
+    """Return the attributes of a point cloud: the arrays of `read_splats`, the change of the normal across each splat, and a radius.
 
     `normal_u` and `normal_v` (N, 3) are the change of the normal along the splat's first and second axis, per standard deviation. Blender's
     vectors have three components and its colours four. So scale gets a third component and base_color a fourth, both 1.

@@ -1,7 +1,7 @@
 """Ask before Blender closes whether running trainings continue or stop.
 
-Blender does not tell an add-on that it is about to close. So only the quit key and an entry in the File menu can ask. Blender can be closed
-in other ways too: for these, each training has a checkbox that keeps it running.
+Blender does not tell an add-on that it is about to close. So only the quit key and an entry in the File menu can ask. Blender can also be
+closed in other ways. Then a training continues only if its checkbox to keep it running is set.
 """
 
 import sys

@@ -142,7 +142,7 @@ CLASSES = (Relight, RecoveredLight, MatchLight, LightPanel)
 
 @bpy.app.handlers.persistent
 def _follow_world(scene: bpy.types.Scene, *_) -> None:
-    """Keep diffuse light right when the world was rotated, or replaced, by hand or in an animation."""
+    """Correct the diffuse light after the world was rotated or replaced, by hand or by an animation."""
     correct_diffuse(scene)
 
 

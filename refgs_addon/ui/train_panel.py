@@ -314,7 +314,7 @@ def command_button(layout: bpy.types.UILayout, job: jobs.Job, command: str, *, t
 
 
 def _draw_run(box: bpy.types.UILayout, scene: bpy.types.Scene, folder: Path, width: int) -> None:
-    """Draw a run of the scene's list: a button that imports or resumes it, or the progress of its training, and its decisions.
+    """Draw a run of the scene's list: a button that imports or resumes it, or the progress of its training; then its decisions.
 
     `width` is how many letters fit into a line.
     """

@@ -139,7 +139,8 @@ class Backdrop:
         - Where the photos show the plane, but its colour is not known, as below the object: a negative number, −(odds of object to plane).
         - Elsewhere: NaN. All pixels are NaN if fewer than 200 show the plane in a known colour.
 
-        The photo's exposure and noise are measured on the pixels that are not `hidden`.
+        The photo's exposure and noise are measured on the pixels that are not `hidden`. If too few of them show the plane, all values are
+        NaN.
         """
         texel, meets = self._pixels_on(camera)
         known = meets & (remap(self.known.astype(np.uint8), texel, cv2.INTER_NEAREST) > 0)
@@ -222,5 +223,5 @@ def _logarithm(image: np.ndarray) -> np.ndarray:
 
 
 def _lab(image: np.ndarray) -> np.ndarray:
-    """Convert float RGB of 0..255 to Lab with all channels on 8-bit scales."""
+    """Convert RGB, float32 0..255, to Lab, float32. L is scaled to 0..255, as in 8-bit Lab; a and b are as they are."""
     return cv2.cvtColor(image / 255, cv2.COLOR_RGB2LAB) * np.array([2.55, 1, 1], np.float32)

@@ -11,7 +11,7 @@ from refgs.settings import RegionSettings
 class Box:
     """Hold a box with any position, size and rotation.
 
-    `matrix` (4, 4) maps the cube from −1 to 1 onto the box. Its columns are three vectors, each half an edge of the box, and the centre.
+    `matrix` (4, 4) maps the cube from −1 to 1 onto the box. Its columns are half of each edge as a vector, then the centre.
     """
 
     matrix: np.ndarray

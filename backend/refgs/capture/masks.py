@@ -166,8 +166,9 @@ def with_masks(
 def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, float]:
     """Guess a box around the object: a cube around the point at which the cameras look.
 
-    `views` are the capture's views. The caller has removed the masks that it wants to ignore. Returns the box, the fraction of it that
-    the object is likely to fill, and the radius of the region of interest. Raises InputError if the cameras look outwards, as in a room.
+    `views` are the capture's views, without the masks that the caller wants to ignore. Returns the box, the fraction of the box's edges
+    that the object is likely to fill, and the radius of the region of interest. Raises InputError if the cameras look outwards, as in a
+    room.
     """
     found = find_region(views, up_direction(views), capture.points, [])
     if found.because == LOOK_OUT:
@@ -302,7 +303,7 @@ def _load(view: View, root: Path, side: int, judge: _Judge | None) -> Photo:
 
 
 def _read_strokes(file: Path, view: View, camera: Camera) -> np.ndarray:
-    """Read an artist's strokes as int8 (H, W): 1 is the object, −1 is not, 0 is unmarked.
+    """Read an artist's strokes as int8 (H, W): 1 marks the object, −1 the rest, 0 says nothing.
 
     The strokes are undistorted and resized to `camera`, like the photo. Raises InputError if they lack transparency, or if their shape is
     not the photo's.

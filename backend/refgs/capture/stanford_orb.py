@@ -1,7 +1,7 @@
 """Read captures of Stanford-ORB in its NeRF-Blender form: `blender_HDR/SCENE` or `blender_LDR/SCENE`.
 
-The layout is that of the README of Stanford-ORB's repository and of its `orb/datasets/mymethod.py` (Kuang et al., NeurIPS 2023). It is
-NeRF-Blender's, and more:
+The layout is described in the README of Stanford-ORB's repository and in its `orb/datasets/mymethod.py` (Kuang et al., NeurIPS 2023). It is
+NeRF-Blender's layout with these additional files:
 
     {train,test}_mask/NAME.png      masks of the photos {train,test}/NAME.exr, or .png
     transforms_novel.json           cameras of the test photos of the same object in other scenes, in this scene's coordinates. A

@@ -12,7 +12,7 @@ Seconds = Annotated[Finite, Field(ge=0)]
 
 
 class Facts(Model):
-    """Hold what a checkpoint knows besides its tensors.
+    """Hold everything in a checkpoint except its tensors.
 
     `parts` maps the name of each `refgs.train.part.Part` to its facts. `clock` maps each part of an iteration to the seconds spent in it.
     """

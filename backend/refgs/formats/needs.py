@@ -55,7 +55,7 @@ class Found(Model):
 
 
 class Row(Model):
-    """Hold one part of the training, `why` it was kept or left out, and in words what leaving it out saved and cost."""
+    """Hold a row of needs.json: an optional part (`what`), `why` it was kept or left out, what leaving it out `saved`, and its `cost`."""
 
     model_config = ConfigDict(extra="allow")  # the figures behind the words
 

@@ -84,8 +84,8 @@ def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def _untrimmed(mesh: trimesh.Trimesh) -> np.ndarray:
     """Mark the faces (F,) that belong neither to crumbs nor to frays, as `clean` defines them.
 
-    This is a morphological opening of the surface. FRAY rings of faces are removed along its borders, then the crumbs that this makes. What
-    remains grows by as many rings. Surfaces fray where photos end, because few photos tell what is there.
+    This is a morphological opening of the surface. FRAY rings of faces are removed along the borders. The pieces that have become crumbs
+    are removed too. What remains grows back by FRAY rings. Surfaces fray where photos end, because few photos show what is there.
     """
     border = np.zeros(len(mesh.vertices), bool)
     border[_border(mesh)] = True

@@ -39,8 +39,8 @@ class Learned(Mapping[str, Tensor]):
     """Hold the tensors that a training learns, by name, with Adam's moments, learning rates and limits.
 
     A tensor is by row if it has one row for each surfel. The rows of all such tensors are replaced together (see `rows`). A tensor by row
-    that gets no gradient, such as a mask, is replaced with them, but Adam does not change it. `constant` holds the tensors that no longer
-    learn, each with one row for all surfels.
+    may get no gradient, such as a mask: its rows are replaced as well, but Adam does not change it. `constant` holds the tensors that no
+    longer learn, each with one row for all surfels.
 
     One kernel updates all tensors with Adam (Kingma and Ba 2015). Elements whose gradient is zero keep their value and their moments. So a
     surfel that is not visible does not move. In the original Adam it would still move, because its moments decay slowly.
@@ -203,7 +203,7 @@ class Learned(Mapping[str, Tensor]):
         return tensors
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over a checkpoint's values of the tensors that are learned or constant here.
+        """Take over a checkpoint's values of the tensors that are learned or constant now.
 
         A parameter may be constant in the checkpoint and learned here: then its one row is repeated for all surfels. It may be learned in
         the checkpoint and constant here: then its first row is taken. A learned tensor that is not by row is dropped if the checkpoint

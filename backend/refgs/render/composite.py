@@ -23,7 +23,8 @@ Progress = Callable[[int, int], None]
 def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress: Progress) -> np.ndarray:
     """Composite the splats at points (N, 3) on a surface with unit normals (N, 3).
 
-    Returns (N, 8): base colour, metallic, roughness, unit normal; (N, 9) with the doubt, if the splats have one.
+    Returns (N, 8): base colour, metallic, roughness, unit normal. If the splats have a doubt (how little photos tell metal from paint), it
+    follows as a ninth column.
 
     At each point a ray looks at the surface from outside, along the reversed normal. Splats are composited front to back if they are near
     the surface and face outwards. A splat's alpha is its opacity times its Gaussian where the ray meets the splat's plane. The result is

@@ -42,7 +42,7 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rasterise float64 tensors as `refgs.render.rasterize.rasterize` does. Returns features, depth, alpha, and a margin (H, W).
 
-    Depth only counts the surfels that `trimmed_depth` averages between `upper` and `lower`.
+    Depth counts only the share of each surfel's weight that lies between the transmittances `upper` and `lower` (see `trimmed_depth`).
 
     A pixel depends on comparisons with thresholds, such as the least alpha. The margin is the smallest relative distance from any of these
     thresholds. Where it is tiny, a rounding error can change the pixel.

@@ -60,7 +60,7 @@ def with_normals_last(surfels: Surfels) -> Surfels:
 class _HalfAngle(Function):
     """Compute atan2(y, x) / 2, with a derivative that fades to zero near the origin, where the angle is undefined.
 
-    Near means that x and y are tiny compared with `size`.
+    A point is near the origin if x and y are tiny compared with `size`.
     """
 
     @staticmethod

@@ -52,10 +52,10 @@ def continue_with_hints(state: State, run: Path, hints: list[Hint]) -> None:
 
 
 def hinted_kinds(state: State, splats: np.ndarray, hints: list[Hint]) -> torch.Tensor:
-    """Return for each surfel (N,) the index of its hinted kind in `KINDS`, −1 without a hint.
+    """Return for each surfel (N,) the index in `KINDS` of the kind that a hint gives it, −1 without a hint.
 
-    `splats` (M, 3) are the positions of the run's splats. Each point of a hint belongs to the nearest splat. If several hints name a splat,
-    the last one counts. A surfel takes the kind of the nearest splat, because surfels that no photo shows have no row in splats.ply.
+    `splats` (M, 3) are the positions of the run's splats. Each point of a hint marks the nearest splat. If several hints mark a splat, the
+    last one counts. Surfels take the kind of the nearest splat, because splats.ply has no rows for surfels that no photo shows.
     """
     tree, kinds = cKDTree(splats), np.full(len(splats), -1)
     for hint in hints:

@@ -85,8 +85,8 @@ def _choose_light_frame(state: State, start: Parameters, on_hull: int) -> None:
 def _start_learning(state: State, start: Parameters) -> None:
     """Start learning the surfels, the light and the photos' exposures.
 
-    Surfels start with the parameters `start`. Parameters that do not affect this run's pictures are constant, and so are those that the
-    rendering method fixes.
+    Surfels start with the parameters `start`. Two kinds of parameters are constant: those that do not affect this run's pictures, and those
+    that the rendering method sets.
     """
     settings, method = state.settings, state.method
     state.learned = Learned(state.capture.radius, method.light.brightest)

@@ -101,7 +101,7 @@ class Trainer:
         return figures
 
     def _learn(self, step: Step) -> dict[str, Tensor]:
-        """Render the photo, and take a step of Adam towards it. Returns what `step` returns."""
+        """Render the photo, and take a step of Adam towards it. Returns the `loss` and the mean squared error, `square`."""
         state = self.state
         inputs, step.photo = state.inputs(), coarse.photo(state, step.view, WHOLE.due(state, step))
         step.rendering = state.picture(inputs, step.photo.camera, exposures.exposure(state, step.view))
@@ -170,7 +170,7 @@ class Trainer:
     def _should_stop(self, stop: Callable[[], bool]) -> bool:
         """Call `stop` and return its answer.
 
-        While `stop` does not return, the training is paused. A time limit does not count that time.
+        `stop` may wait to pause the training. The time limit does not count the wait.
         """
         begun = time.perf_counter()
         stopped = stop()

@@ -1,6 +1,6 @@
-"""Write pictures of a training view with and without an optional part of the training, when it is decided whether to leave it out.
+"""Write pictures of a training view with and without an optional part of the training, when the training decides whether to keep the part.
 
-They show the artist what a decision of `refgs.train.decide.needs` is about. They are written to the run folder, in `needs/`.
+The pictures show the artist what a decision of `refgs.train.decide.needs` is about. They are in the run folder, in `needs/`.
 """
 
 import math
@@ -81,7 +81,7 @@ def _reflections(state: State, found: Found, views: list[int]) -> Iterator[tuple
 
 
 def _mean_radiance(state: State, inputs: RenderInputs, views: list[int]) -> Tensor:
-    """Return the mean linear radiance (3,) of the object's pixels in the views, as `inputs` render it."""
+    """Return the mean linear radiance (3,) of the object's pixels, in pictures of the views rendered from `inputs`."""
     shown = (
         probe.picture(state, view, inputs).radiance[probe.on_object(state, inputs.surfels, view)] for view in views
     )

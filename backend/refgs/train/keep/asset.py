@@ -146,7 +146,7 @@ def _write_refined_cameras(state: State) -> None:
 def _irradiance(surfels: Surfels, environment: Environment, state: State) -> Tensor:
     """Compute the irradiance of each surfel, divided by π (N, 3).
 
-    If the light turned with the camera, average over the photos. In each photo the surfel is lit on the side that faces the camera, and
+    If the light turns with the camera, average over the photos. In each photo the surfel is lit on the side that faces the camera, and
     photos that show the surfel at a grazing angle count less.
     """
     normals = surfels.normals()

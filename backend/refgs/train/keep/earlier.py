@@ -19,7 +19,7 @@ RENAMED = {
 def as_of_today(tensors: dict[str, Tensor], facts: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Return the tensors and facts of a checkpoint in today's form.
 
-    Release 0.1.0 marked held surfels by the value of their metallic, and stored the facts of each part under a name of their own.
+    Release 0.1.0 marked held surfels by the value of their metallic, and stored each part's facts as separate top-level keys.
     """
     if "residual" in facts:
         return tensors, facts

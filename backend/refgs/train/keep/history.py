@@ -24,7 +24,7 @@ def allowed(iteration: int, total: int, seconds: float) -> float:
     If measuring has taken longer than this limit, errors are not measured now. `total` is the training's number of iterations, and
     `seconds` is how long it has taken so far.
 
-    At the end of the training, the limit is the fraction SHARE of the training's time. Before, it grows with the logarithm of the
+    At the training's end, the limit is the fraction SHARE of its time. During the training, the limit grows with the logarithm of the
     iteration, because errors are measured at iterations that are evenly spaced by logarithm. The time for the image error FLIP is counted
     separately, and compared with the same limit.
     """

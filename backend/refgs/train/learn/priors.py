@@ -1,8 +1,8 @@
 """Use normals and depth that other programs guessed from single photos, early in the training.
 
-Photos of mirrors and hollows can also be explained by wrong shapes, such as the visual hull's lid over a bowl. A network that guesses from
-one photo knows what bowls look like. Its guess is wrong in detail, and its depth has no scale. So these terms of the loss saturate, and
-fade to zero: in the end, only the photos count.
+Photos of mirrors and hollow shapes can also be explained by wrong shapes, such as the visual hull's lid over a bowl. A network that guesses
+from one photo knows what bowls look like. Its guess is wrong in detail, and its depth has no scale. So these loss terms saturate, and fade
+to zero: in the end, only the photos count.
 
 Programs write normals with different axes. The axes that agree best with the surfels at the start are used for all views. Depth is fitted
 to the rendered depth each time that it is used, with one scale and one shift per view.
@@ -58,7 +58,7 @@ class Priors(Part):
 def load(state: State) -> None:
     """Load the priors of the training views, and find out what they mean: the axes of normals, and whether depth is a disparity.
 
-    Priors are used only if all photos have masks. Without masks, no shape is known with which to compare them.
+    Priors are used only if all photos have masks. Without masks, there is no shape to compare the priors with.
     """
     given = {view.camera.name: view for view in state.capture.train_views if view.prior_normals or view.prior_depth}
     if state.settings.loss.prior == 0 or not given:
@@ -163,11 +163,11 @@ def fitted(guessed: Tensor, depth: Tensor, counts: Tensor, disparity: bool, radi
 
 
 def axes_of(pairs: Iterable[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor | None, float]:
-    """Find the axes of guessed normals. Each of `pairs` has three sets of unit vectors (P, 3), all seen by one camera:
+    """Find the axes of guessed normals. Each of `pairs` has three sets of unit vectors (P, 3) for the view of one camera:
 
-    - those of the surface, in the camera's axes (x right, y down, z forward)
-    - the guessed ones, as they are in the file
-    - the guessed ones turned to the camera's axes, as if those in the file were in world space
+    - the surface's normals, in the camera's axes (x right, y down, z forward)
+    - the guessed normals, as they are in the file
+    - the guessed normals turned to the camera's axes, for the case that the file has them in world space
 
     Returns the signs (3,) by which to multiply the file's x, y and z, or None if the normals are in world space. The answer with the larger
     mean cosine is chosen. Also returns how well the guesses then agree with the surface: the smaller of the correlations in x and in y.
@@ -227,7 +227,7 @@ def _with_axes(state: State, normals: Maps) -> Maps:
 def _near_outline(photo: Photo) -> Tensor:
     """Tell which pixels (H, W) lie just inside the outline of a photo's mask.
 
-    There, the visual hull has the normals of the surface, even where its lid covers a bowl.
+    Just inside, the visual hull has the surface's normals, even if elsewhere its lid covers a bowl.
     """
     if photo.mask is None:
         return torch.zeros(photo.image.shape[:2], dtype=torch.bool, device=photo.image.device)

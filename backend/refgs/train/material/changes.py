@@ -54,8 +54,8 @@ class Shining(NamedTuple):
 def change_seen(observations: Observations, wanted: Tensor) -> float:
     """Measure how much the surface changes with the viewing direction: a cubic mean over the surfels `wanted` (N,).
 
-    A surfel's change is the standard deviation of its sRGB-encoded colour over the photos. Surfels are weighted by their pixels. A cubic
-    mean lets a small part that changes much, such as a chrome handle, count more than a plain mean would. Returns 0 if no surfel is usable.
+    A surfel's change is the standard deviation of its sRGB-encoded colour over the photos. Surfels are weighted by the pixels they cover. A
+    cubic mean lets a small part that changes much, such as a chrome handle, count more than a plain mean. Returns 0 if no surfel is usable.
     """
     usable = observations.usable
     count = usable.sum(dim=1).clamp_min(2)
@@ -72,9 +72,9 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Shining:
     """Find the surfels that change with the view as a coloured metal does.
 
     A metal tints what it reflects: its radiance changes along its own colour. A dielectric's reflection has the light's colour, which is
-    grey on average, whatever colour lies below. The direction of change is the first principal axis of the linear radiance over the photos.
-    Radiance is first averaged over neighbours: slightly misaligned texture then cancels, and highlights do not. Surfels near grey tell
-    nothing.
+    grey on average, whatever the dielectric's own colour is. The direction of change is the first principal axis of the linear radiance
+    over the photos. Radiance is first averaged over neighbouring surfels. This cancels errors by slightly misaligned texture, but not
+    highlights. Surfels near grey tell nothing.
     """
     near = neighbours(positions, NEIGHBOURS)
     mean, change, known = averaged(observations, near)
