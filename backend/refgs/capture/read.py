@@ -178,7 +178,8 @@ def _check_cameras(folder: Path, views: list[View]) -> None:
             "At least three are needed, thirty or more are good: add photos."
         )
     positions = np.array([view.camera.position for view in train])
-    if np.ptp(positions, axis=0).max() <= 1e-6 * np.abs(positions).max():
+    # Relative to float64's resolution, not to the distance from the origin: map coordinates have an origin far away.
+    if np.ptp(positions, axis=0).max() <= 1e-12 * max(1.0, np.abs(positions).max()):
         raise InputError(f"{folder}: all cameras are in one place, so no depth can be seen. Photograph from around it.")
 
 

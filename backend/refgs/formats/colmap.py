@@ -17,21 +17,30 @@ from refgs.errors import InputError
 
 T = TypeVar("T")
 
-# COLMAP's "Camera Models": number, name, count of parameters. Text files use the names.
+UNDISTORT = "Undistort the photos with COLMAP's image_undistorter and use its output."
+
+# COLMAP's "Camera Models": number, name, parameters. Text files use the names.
 MODELS = {
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8),
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
+    0: ("SIMPLE_PINHOLE", "f cx cy"),
+    1: ("PINHOLE", "fx fy cx cy"),
+    2: ("SIMPLE_RADIAL", "f cx cy k"),
+    3: ("RADIAL", "f cx cy k1 k2"),
+    4: ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
+    5: ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4"),
+    6: ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    7: ("FOV", "fx fy cx cy omega"),
+    8: ("SIMPLE_RADIAL_FISHEYE", "f cx cy k"),
+    9: ("RADIAL_FISHEYE", "f cx cy k1 k2"),
+    10: ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3"),
+    12: ("SIMPLE_DIVISION", "f cx cy k"),
+    13: ("DIVISION", "fx fy cx cy k"),
+    14: ("SIMPLE_FISHEYE", "f cx cy"),
+    15: ("FISHEYE", "fx fy cx cy"),
+    16: ("EUCM", "fx fy cx cy alpha beta"),
+    17: ("EQUIRECTANGULAR", "w h"),
 }
-SUPPORTED = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+PARAMETERS = {name: tuple(parameters.split()) for name, parameters in MODELS.values()}
 
 
 @dataclass(frozen=True)
@@ -117,9 +126,9 @@ def _binary_cameras(file: Path) -> dict[int, Intrinsics]:
     for _ in range(source.take("Q")[0]):
         number, model, width, height = source.take("iiQQ")
         if model not in MODELS:
-            raise InputError(f"{file}: camera model number {model} is not supported, only {', '.join(SUPPORTED)}.")
-        name, count = MODELS[model]
-        cameras[number] = Intrinsics(name, width, height, source.take(f"{count}d"))
+            raise InputError(f"{file}: camera model number {model} is not known. {UNDISTORT}")
+        name = MODELS[model][0]
+        cameras[number] = Intrinsics(name, width, height, source.take(f"{len(PARAMETERS[name])}d"))
     return cameras
 
 
@@ -166,7 +175,7 @@ def _text_cameras(file: Path) -> dict[int, Intrinsics]:
     cameras = {}
     for line in _entries(file):
         number, model, width, height, *params = line.split()
-        if len(params) != dict(MODELS.values()).get(model, len(params)):
+        if len(params) != len(PARAMETERS.get(model, params)):
             raise ValueError("parameters missing")
         cameras[int(number)] = Intrinsics(model, int(width), int(height), tuple(map(float, params)))
     return cameras
