@@ -25,6 +25,7 @@ from refgs.capture.region import (
     run_frame,
     sample_silhouettes,
     up_direction,
+    warn_of_axes,
 )
 from refgs.capture.stanford_orb import NOVEL, read_stanford_orb
 from refgs.capture.tensoir import is_tensoir, read_tensoir
@@ -101,7 +102,7 @@ def to_run_frame(files: CaptureFiles, wanted: RegionSettings | None = None) -> C
         reach=reach,
         box=box,
         digest=_digest(folder, layout, views),
-        warnings=[*files.warnings, *white],
+        warnings=[*files.warnings, *white, *warn_of_axes(layout, views)],
     )
     return capture if np.array_equal(to_capture, np.eye(4)) else _in_run_frame(capture, unit)
 

@@ -104,6 +104,20 @@ def look_at_centre(views: list[View]) -> tuple[np.ndarray, np.ndarray, float]:
     return centre, depth, float(np.median(miss) / max(np.median(np.abs(depth)), 1e-12))
 
 
+def warn_of_axes(layout: str, views: list[View]) -> list[str]:
+    """Return a warning if a JSON file's axes look like OpenCV's: the cameras look away from the place where their optical axes meet.
+
+    Cameras that look out of a room hardly do: their axes miss each other. A rig may, so the file is read as its format says all the same.
+    """
+    _, depth, miss = look_at_centre(views)
+    if layout not in ("nerfstudio", "nerf-blender") or (depth < 0).mean() < 0.75 or miss > 0.25:
+        return []
+    what = f"{(depth < 0).sum()} of {len(views)} cameras look away from where their axes meet, as if the file had OpenCV's axes"
+    return [
+        f'{what}, not OpenGL\'s. If the photos show an object from around it, add "camera_convention": "opencv" to the file'
+    ]
+
+
 def up_direction(views: list[View]) -> np.ndarray:
     """Estimate the world's up direction (3,), in the coordinates of the cameras.
 
