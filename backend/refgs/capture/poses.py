@@ -6,11 +6,10 @@ import numpy as np
 
 from refgs.camera import Camera
 from refgs.errors import InputError
+from refgs.formats.colmap import FARTHEST
 
 # OpenGL camera axes (y up, looking along −z) to OpenCV's (y down, looking along +z), and back.
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-
-FARTHEST = 1e12  # largest coordinate: beyond it, float64 does not resolve an object of 1 unit well
 
 
 def world_to_camera(camera_to_world: object, where: str) -> np.ndarray:

@@ -43,6 +43,9 @@ MODELS = {
 PARAMETERS = {name: tuple(parameters.split()) for name, parameters in MODELS.values()}
 
 
+FARTHEST = 1e12  # largest coordinate: beyond it, float64 does not resolve an object of 1 unit well
+
+
 @dataclass(frozen=True)
 class Intrinsics:
     model: str
@@ -81,7 +84,7 @@ def read_images(file: Path) -> list[Image]:
 def read_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read the points (M, 3) of a COLMAP model and their colours (M, 3), sRGB-encoded in 0..1. Raises InputError for a broken file.
 
-    Points with a NaN or infinite value are left out.
+    Points with a value that is NaN, infinite or beyond FARTHEST are left out: no camera is there.
     """
     return _parse(file, _binary_points, _text_points)
 
@@ -151,20 +154,17 @@ def _binary_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _points(rows: list) -> tuple[np.ndarray, np.ndarray]:
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
-    table = table[np.isfinite(table).all(axis=1)]
+    table = table[(np.abs(table) <= FARTHEST).all(axis=1)]
     return table[:, :3], table[:, 3:] / 255.0
 
 
-def _entries(file: Path, lines_each: int = 1) -> list[str]:
-    """Split a COLMAP text file into entries of `lines_each` lines. Return the first line of each entry.
+def _entries(file: Path, first: Callable[[str], bool] = lambda line: True) -> list[str]:
+    """Return the lines of a COLMAP text file that `first` says begin an entry, without comments and empty lines.
 
     Raises ValueError if the file has fewer entries than its header says.
     """
     lines = file.read_text(encoding="utf-8").splitlines()
-    entries = [line for line in lines if not line.startswith("#") and (lines_each > 1 or line.strip())]
-    while entries and not entries[-1].strip():  # the line of keypoints may be empty
-        entries.pop()
-    entries = entries[::lines_each]
+    entries = [line for line in lines if line.strip() and not line.startswith("#") and first(line)]
     counted = next((match for line in lines if (match := re.match(r"# Number of \w+: (\d+)", line))), None)
     if counted and len(entries) < int(counted[1]):
         raise ValueError("fewer entries than counted")
@@ -183,12 +183,27 @@ def _text_cameras(file: Path) -> dict[int, Intrinsics]:
 
 def _text_images(file: Path) -> list[Image]:
     images = []
-    for line in _entries(file, lines_each=2):  # the second line holds keypoints
+    for line in _entries(file, _is_image):
         _, *pose, camera_id, name = line.split(maxsplit=9)
         if len(pose) != 7:
             raise ValueError("numbers missing")
         images.append(Image(name.strip(), int(camera_id), tuple(map(float, pose))))
     return images
+
+
+def _is_image(line: str) -> bool:
+    """Tell a line of an image from its line of keypoints, which may be empty, and which some programs leave out.
+
+    Keypoints are triples of numbers; an image ends in its name. Raises ValueError for a line that is neither.
+    """
+    values = line.split()
+    try:
+        float(values[-1])
+    except ValueError:
+        return True
+    if len(values) != 10 and len(values) % 3:
+        raise ValueError("numbers missing")
+    return len(values) == 10  # the image's name is a number
 
 
 def _text_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
