@@ -195,6 +195,19 @@ def test_colmap_files_cut_short(tmp_path, name, binary, kept):
     refused(lambda: read_capture(tmp_path), file.name, "truncated")
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "model", [(3, "RADIAL", [60.0, 32, 24, 0, 1e308]), (5, "OPENCV_FISHEYE", [60.0, 60, 32, 24, 0, 0, 0, 1e308])]
+)
+def test_colmap_coefficients_of_1e308(tmp_path, model):
+    refused(
+        lambda: read_capture(colmap(tmp_path, True, model)),
+        "0000.png",
+        "distortion is too strong",
+        model[1].replace("RADIAL", "BROWN"),
+    )
+
+
 def test_colmap_focal_length_nan(tmp_path):
     model = (1, "PINHOLE", [float("nan"), 60.0, 32.0, 24.0])
     refused(lambda: read_capture(colmap(tmp_path, True, model)), "0000.png", "focal length")

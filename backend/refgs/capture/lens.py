@@ -102,7 +102,9 @@ class Lens:
         """
         factor = _focal_factor(self, camera.width, camera.height)
         if factor is None:
-            raise InputError(f"{where}: the distortion is too strong for a perspective photo. Undistort it first.")
+            raise InputError(
+                f"{where}: the distortion is too strong for a perspective photo ({self.model}). Undistort it first."
+            )
         return replace(camera, fx=self.fx * factor, fy=self.fy * factor, cx=self.cx, cy=self.cy)
 
     def maps(self, camera: Camera, rows: slice = ALL) -> tuple[np.ndarray, np.ndarray]:
@@ -182,9 +184,9 @@ def _focal_factor(lens: Lens, width: int, height: int) -> float | None:
     """
     u, v = np.meshgrid(np.linspace(0, width, 65), np.linspace(0, height, 65))
 
+    @np.errstate(over="ignore", invalid="ignore")
     def fits(factor: float) -> bool:
-        with np.errstate(over="ignore", invalid="ignore"):
-            x, y = lens.distort((u - lens.cx) / (lens.fx * factor), (v - lens.cy) / (lens.fy * factor))
+        x, y = lens.distort((u - lens.cx) / (lens.fx * factor), (v - lens.cy) / (lens.fy * factor))
         u2, v2 = lens.fx * x + lens.cx, lens.fy * y + lens.cy
         inside = (u2 >= 0) & (u2 <= width) & (v2 >= 0) & (v2 <= height)
         # Far from the axis the polynomial may fold back into the picture: the map must keep its orientation.
