@@ -12,11 +12,12 @@ from numpy.lib.recfunctions import append_fields
 from ..errors import InputError
 from ..nodes.kept_tree import ROW
 from ..nodes.splats_tree import NAME as SPLATS
+from ..ply_file import PLY_TYPES, read_rows
 from .atomic_file import atomic_write
 from .edit import edits, is_edited, splats_of
 from .mesh_exchange import TEXTURES, write_mesh
 from .run_parts import FOLDER
-from .splat_cloud import MATERIALS, PLY_TYPES, SH_DC, finite_rows, read_constants, read_rows, srgb_to_linear
+from .splat_cloud import MATERIALS, SH_DC, finite_rows, read_constants, srgb_to_linear
 
 KEPT = ("environment.exr", "cameras.json", "needs.json", "occluder.ply", "run.toml")
 DARK = 0.02  # a darker base colour does not reveal how much light falls on it

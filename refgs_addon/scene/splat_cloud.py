@@ -1,7 +1,6 @@
 """Read a splats.ply, and make a Blender point cloud of it. Each splat is a point with its material as attributes."""
 
-import itertools
-import os
+import re
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -12,21 +11,22 @@ from .. import compat
 from ..errors import InputError
 from ..nodes.splat_material import splat_material, values_material
 from ..nodes.splats_tree import NAME, splats_tree
+from ..ply_file import read_header, read_rows
 
 MATERIALS = "albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"
 SURFACE = {"metallic": 0.0, "roughness": 1.0, "specular": 0.5}  # possible constants of a file, with their defaults
 SH_DC = 0.28209479177387814  # the constant spherical harmonic
-MAX_HEADER = 100_000  # bytes
 _STEPS = 1, 2, 4, 7, 11, 16  # neighbours along a curve, with gaps: many splats lie on top of each other
 _SHIFTS = 0.0, 0.23
 _SPREAD = (  # shifts and masks that put two zeros between the bits of a number
     (32, 0x001F00000000FFFF), (16, 0x001F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
 )  # fmt: skip
 _TYPES = {"base_color": "FLOAT_COLOR", "rotation": "QUATERNION"}
-PLY_TYPES = {  # numpy types by PLY's newer names, and by the older ones, which all readers know
-    "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4", "float32": "<f4", "float64": "<f8",
-    "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4", "float": "<f4", "double": "<f8",
-}  # fmt: skip
+REF_GAUSSIAN = "ori_color_0", "ori_color_1", "ori_color_2", "refl_strength", "roughness"  # its materials, as logits
+_SPLATS = re.compile(
+    r"[xyz]|n[xyz]|f_dc_[012]|f_rest_\d+|opacity|scale_[012]|rot_[0123]|albedo_[rgb]|metallic|roughness|doubt|received_[rgb]|ind_\d+"
+    r"|ori_color_[012]|refl_strength"
+)
 _ROWS = 4096  # rows at a time, to fit the processor's cache
 
 
@@ -86,8 +86,7 @@ def point_cloud(name: str, values: dict[str, np.ndarray]) -> bpy.types.PointClou
 def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
     """Read the splats of a PLY file. Returns their arrays by name, and the number of splats left out because a value is not finite.
 
-    The file is a run's splats.ply, or comes from a 3DGS or 2DGS program. It is binary and little-endian, with 3DGS's property names. The
-    float32 arrays are:
+    The file is a run's splats.ply, or comes from a 3DGS, 2DGS or Ref-Gaussian program, with 3DGS's property names. The float32 arrays are:
     - position (N, 3);
     - normal (N, 3), of unit length;
     - scale (N, 2), in standard deviations;
@@ -100,10 +99,14 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
     shortest axis as normal. Raises InputError for any other file.
     """
     all_rows = read_rows(path)
+    if "packed_position" in all_rows.dtype.names:
+        raise InputError(f"{path} is a compressed PLY: make a plain one of it, with splat-transform or SuperSplat")
     rows = finite_rows(all_rows)
     if not len(rows):
         raise InputError(f"{path} has no splat with finite values: export the run again")
-    found, constants = set(rows.dtype.names), read_constants(path)
+    found = set(rows.dtype.names)
+    ours = not found.isdisjoint(MATERIALS[:4])  # others have a roughness, too
+    constants = read_constants(path) if ours else {}
     names = {
         "position": ["x", "y", "z"],
         "scale": ["scale_0", "scale_1", *(["scale_2"] if "scale_2" in found else [])],
@@ -112,16 +115,23 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
     }
     if {"nx", "ny", "nz"} <= found:
         names["normal"] = ["nx", "ny", "nz"]
-    if found.isdisjoint(MATERIALS):
-        names["look"] = ["f_dc_0", "f_dc_1", "f_dc_2"]
-    else:
+    names["look"] = ["f_dc_0", "f_dc_1", "f_dc_2"]
+    if ours:
         names["base_color"] = list(MATERIALS[:3])
         names |= {name: [name] for name in MATERIALS[3:] if name not in constants}
         if "doubt" in found:
             names["doubt"] = ["doubt"]
+        names["normal"] = ["nx", "ny", "nz"]
+    elif {*REF_GAUSSIAN} <= found:
+        names |= {"base_color": list(REF_GAUSSIAN[:3]), "metallic": ["refl_strength"], "roughness": ["roughness"]}
     missing = [name for group in names.values() for name in group if name not in found]
     if missing:
         raise InputError(f"{path} has no {', '.join(missing)}: it is not the splats.ply of a RefGS run")
+    for prefix, counts in (("f_rest_", (0, 9, 24, 45)), ("ind_", (0, 3, 12, 27, 48))):
+        numbers = {name for name in found if re.fullmatch(rf"{prefix}\d+", name)}
+        if len(numbers) not in counts or numbers != {f"{prefix}{i}" for i in range(len(numbers))}:
+            known = ", ".join(map(str, counts))
+            raise InputError(f"{path} has {len(numbers)} {prefix} values a splat: spherical harmonics have {known}")
     splats = {key: np.stack([rows[name] for name in group], axis=-1) for key, group in names.items()}
     splats = {key: value[:, 0] if value.shape[1] == 1 else value for key, value in splats.items()}
     splats = {key: value.astype(np.float32, copy=False) for key, value in splats.items()}
@@ -130,8 +140,13 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
     splats["rotation"] /= np.maximum(np.linalg.norm(splats["rotation"], axis=1, keepdims=True), 1e-12)
     for name in {*MATERIALS[3:]} & {*constants}:
         splats[name] = np.full_like(splats["opacity"], constants[name])
-    if "look" in splats:
-        splats["base_color"] = srgb_to_linear((0.5 + SH_DC * splats.pop("look")).clip(0, 1))
+    look = splats.pop("look")
+    if not ours and "base_color" in splats:
+        for name in ("base_color", "metallic", "roughness"):
+            splats[name] = 1 / (1 + np.exp(-splats[name]))
+        splats["base_color"] = srgb_to_linear(splats["base_color"])
+    elif not ours:
+        splats["base_color"] = srgb_to_linear((0.5 + SH_DC * look).clip(0, 1))
         splats |= {name: np.full_like(splats["opacity"], SURFACE[name]) for name in MATERIALS[3:]}
     if "scale_2" in found:
         splats["rotation"], splats["scale"] = _flatten_gaussians(splats["rotation"], splats["scale"])
@@ -167,37 +182,26 @@ def _flatten_gaussians(rotation: np.ndarray, scale: np.ndarray) -> tuple[np.ndar
 
 
 def finite_rows(rows: np.ndarray) -> np.ndarray:
-    """Select the rows of a PLY whose values are all finite. The trainer selects the same rows.
+    """Select the rows of a PLY whose splats are all finite. The trainer selects the same rows.
 
-    Opacity is stored as a logit and may be infinite, which means fully transparent or fully opaque.
+    Logits may be infinite: an opacity, which is 0 or 1 then, and the materials of Ref-Gaussian. Properties that are not a splat's do not
+    count.
     """
+    names = [name for name in rows.dtype.names if _SPLATS.fullmatch(name)]
+    logits = {"opacity"} if {*REF_GAUSSIAN} - {*names} else {"opacity", *REF_GAUSSIAN}
+    turn = [name for name in names if name.startswith("rot_")]
     fine = np.ones(len(rows), bool)
-    floats = [name for name in rows.dtype.names if rows.dtype[name].kind == "f"]
-    for start in range(0, len(rows), _ROWS):
-        part, kept = rows[start : start + _ROWS], fine[start : start + _ROWS]
-        for name in floats:
-            kept &= ~np.isnan(part[name]) if name == "opacity" else np.isfinite(part[name])
+    with np.errstate(over="ignore", invalid="ignore"):
+        for start in range(0, len(rows), _ROWS):
+            part, kept = rows[start : start + _ROWS], fine[start : start + _ROWS]
+            for name in names:
+                values = part[name].astype(np.float32, copy=False)
+                values = np.exp(values) if name.startswith("scale_") else values
+                kept &= ~np.isnan(values) if name in logits else np.isfinite(values)
+            if turn:
+                length = sum(np.square(part[name].astype(np.float32, copy=False)) for name in turn)
+                kept &= (length > 0) & np.isfinite(length)
     return rows if fine.all() else rows[fine]
-
-
-def read_rows(path: Path) -> np.ndarray:
-    """Read the `vertex` element of a PLY file as a structured array. The file is binary, little-endian, and has that element first.
-
-    Raises InputError for any other file.
-    """
-    try:
-        with open(path, "rb") as file:
-            head, found, _ = file.read(MAX_HEADER).partition(b"end_header\n")
-            kind, count = _parse_header(head, found, path)
-            start = file.seek(len(head) + len(found))
-            # Check the size before allocating: a broken header may have any count.
-            complete = os.fstat(file.fileno()).st_size - start >= count * kind.itemsize
-            rows = np.fromfile(file, kind, count) if complete else ()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
-    if len(rows) < count:
-        raise InputError(f"{path} is truncated: export the run again")
-    return rows
 
 
 def read_constants(path: Path) -> dict[str, float]:
@@ -206,12 +210,7 @@ def read_constants(path: Path) -> dict[str, float]:
     They are comments in the file's header, and are ignored if the file also has a column of that name. Specular is the Principled BSDF's
     Specular IOR Level. Raises InputError if the file cannot be read, or a value is not a number.
     """
-    try:
-        with open(path, "rb") as file:
-            head = file.read(MAX_HEADER).partition(b"end_header\n")[0]
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
-    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    lines = read_header(path)[0]
     columns = {line[2] for line in lines if line[:1] == ["property"] and len(line) == 3}
     found = {}
     for line in lines:
@@ -219,29 +218,10 @@ def read_constants(path: Path) -> dict[str, float]:
             try:
                 found[line[2]] = float(line[3])
             except ValueError:
-                raise InputError(f"{path}: {line[2]} is {line[3]}, not a number: export the run again") from None
+                found[line[2]] = np.nan
+            if not np.isfinite(found[line[2]]):
+                raise InputError(f"{path}: {line[2]} is {line[3]}, not a number: export the run again")
     return found
-
-
-def _parse_header(head: bytes, last_line: bytes, path: Path) -> tuple[np.dtype, int]:
-    """Parse the header of a PLY file. Returns the numpy type of a row, and the number of rows.
-
-    `last_line` is the line "end_header", or empty if it was not found. `path` is only for error messages.
-    """
-    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
-    if not last_line or lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
-        raise InputError(f"{path} is not a binary little-endian PLY file: export the run again")
-    first, *lines = [line for line in lines[2:] if line and line[0] in ("element", "property")] or [[]]
-    properties = list(itertools.takewhile(lambda line: line[0] == "property", lines))
-    if first[:2] != ["element", "vertex"] or any(line[1:2] == ["list"] for line in properties):
-        raise InputError(f"{path} is not a PLY of splats (element vertex first, without lists): export the run again")
-    try:
-        kind, count = np.dtype([(name, PLY_TYPES[kind]) for _, kind, name in properties]), int(first[2])
-    except (IndexError, KeyError, ValueError):
-        raise InputError(f"{path} has a broken header: export the run again") from None
-    if count < 1 or not properties:
-        raise InputError(f"{path} is empty: export the run again")
-    return kind, count
 
 
 def splat_axes(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

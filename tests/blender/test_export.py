@@ -9,11 +9,11 @@ import pytest
 
 from refgs.color import srgb_decode
 from refgs_addon.errors import InputError
+from refgs_addon.ply_file import read_rows
 from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.export_run import SH_DC, edited_materials, export_light, export_mesh, export_run, export_splats
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.run_parts import show
-from refgs_addon.scene.splat_cloud import read_rows
 from tests.makers.runs import COUNT, random_columns, write_ply
 
 

@@ -102,6 +102,6 @@ def test_dropped_files_stand_for_their_folders(run_folder, addon, tmp_path):
 
 def test_a_broken_folder_is_reported_in_one_line(run_folder, addon):
     (run_folder / "splats.ply").write_bytes(b"ply\n")
-    with pytest.raises(RuntimeError, match=r"^Error: .*splats\.ply is not a binary little-endian PLY file[^\n]*\n?$"):
+    with pytest.raises(RuntimeError, match=r"^Error: .*splats\.ply is not a PLY file[^\n]*\n?$"):
         bpy.ops.refgs.import_run(directory=str(run_folder))
     assert not bpy.data.objects and not bpy.data.collections

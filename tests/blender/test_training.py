@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from refgs_addon import job_timers, jobs, preferences, ui
 from refgs_addon.errors import InputError
+from refgs_addon.ply_file import read_rows
 from refgs_addon.scene import regions, training
 from refgs_addon.scene.camera_objects import photo_shown
 from refgs_addon.scene.capture_cameras import cameras_of
 from refgs_addon.scene.import_run import import_run
-from refgs_addon.scene.splat_cloud import read_rows
 from refgs_addon.ui import checked_capture, train_panel
 from refgs_addon.ui.closing import quit_question
 from refgs_addon.ui.icons import CURVE, DOTS, GRID, LINE, plot

@@ -131,6 +131,9 @@ def _pose_entry(row, column, value):
     [
         (_pose_entry(1, 3, float("nan")), "NaN"),
         (_pose_entry(0, 0, float("inf")), "NaN or infinity"),
+        (_pose_entry(1, 3, 1e308), "1e+308 from the origin"),
+        (_pose_entry(1, 3, 2.9e150), "2.9e+150 from the origin"),
+        (lambda m: [row.__setitem__(slice(0, 3), [5e-324 * x for x in row[:3]]) for row in m[:3]], "inverted"),
         (_pose_entry(0, 0, "abc"), "transform_matrix.0.0 should be a valid number"),
         (lambda m: m.pop(), None),  # 3×4 is read
         (lambda m: m.pop(0) and m.pop(0), "4×4"),
@@ -168,8 +171,9 @@ def test_poses(tmp_path, change, says):
         ({"fl_x": None, "fl_y": None, "camera_angle_x": 0}, "focal length"),
         ({"k1": float("inf")}, "distortion"),
         ({"k1": -30.0}, "distortion is too strong"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "perspective"),
-        ({"is_fisheye": True}, "perspective"),
+        ({"fl_x": 1e308}, "focal length of 1e+308"),
+        ({"fl_y": 5e-324}, "focal length of 4.94066e-324"),
+        ({"cx": -1e308}, "principal point (-1e+308 24) is far outside"),
         ({"h": 64}, "64×64 pixels but the photo has 64×48"),
         ({"mask_path": "masks/gone.png"}, "masks/gone.png is missing"),
         ({"file_path": "images/0000.png"}, "0000.png: the capture names this photo 2 times"),
@@ -202,10 +206,17 @@ def test_colmap_files_with_gigabytes_of_zeros(tmp_path, name, binary):
     refused(lambda: read_capture(tmp_path), file.name, "truncated or not COLMAP's")
 
 
-@pytest.mark.parametrize("binary", [True, False])
-def test_colmap_model_not_supported(tmp_path, binary):
-    model = (5, "OPENCV_FISHEYE", [60.0, 60.0, 32.0, 24.0, 0.0, 0.0, 0.0, 0.0])
-    refused(lambda: read_capture(colmap(tmp_path, binary, model)), "OPENCV_FISHEYE", "image_undistorter")
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "model", [(3, "RADIAL", [60.0, 32, 24, 0, 1e308]), (5, "OPENCV_FISHEYE", [60.0, 60, 32, 24, 0, 0, 0, 1e308])]
+)
+def test_colmap_coefficients_of_1e308(tmp_path, model):
+    refused(
+        lambda: read_capture(colmap(tmp_path, True, model)),
+        "0000.png",
+        "distortion is too strong",
+        model[1].replace("RADIAL", "BROWN"),
+    )
 
 
 def test_colmap_focal_length_nan(tmp_path):
@@ -217,9 +228,10 @@ def test_colmap_focal_length_nan(tmp_path):
     ("line", "says"),
     [
         ("1 nan 0 0 0 1 2 3 7 0000.png", ("0000.png", "NaN")),
+        ("1 1e308 0 0 1e308 1e308 2 3 7 0000.png", ("0000.png", "e+308 from the origin")),
         ("1 1 0 0 0 7 0000.png", ("images.txt", "truncated or not COLMAP's")),
     ],
-    ids=["NaN", "numbers missing"],
+    ids=["NaN", "1e308", "numbers missing"],
 )
 def test_colmap_pose(tmp_path, line, says):
     file = colmap(tmp_path, binary=False) / "sparse" / "0" / "images.txt"

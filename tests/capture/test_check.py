@@ -61,6 +61,42 @@ def test_warnings_name_the_first_view(tmp_path):
         assert part in said, said
 
 
+@pytest.mark.parametrize("make", [nerfstudio, nerf_blender])
+def test_axes_of_opencv_are_told_once(tmp_path, make):
+    """Check that one line says that a file's axes look like OpenCV's, and that its advice gives the same cameras as OpenGL's axes."""
+    folder, names = make(tmp_path), ("transforms.json", "transforms_train.json", "transforms_test.json")
+    expected = [view.camera.world_to_camera for view in read_capture(folder).views]
+    assert "OpenCV" not in text(folder)
+
+    def turn(data):
+        for frame in data["frames"]:
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])).tolist()
+
+    files = [folder / name for name in names if (folder / name).exists()]
+    for file in files:
+        edit(file, turn)
+    said = [line for line in text(folder).splitlines() if "OpenCV" in line or "see the centre" in line]
+    assert len(said) == 1 and said[0].startswith("Warning: 16 of 16 cameras look away")
+    assert 'add "camera_convention": "opencv" to the file' in said[0]
+    for file in files:
+        edit(file, lambda data: data.update(camera_convention="opencv"))
+    found = [view.camera.world_to_camera for view in read_capture(folder).views]
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert "OpenCV" not in text(folder)
+    edit(files[0], lambda data: data.update(camera_convention="left-handed"))
+    with pytest.raises(InputError, match="camera_convention is left-handed, which is not known"):
+        read_capture(folder)
+
+
+def test_cameras_in_a_room_are_not_taken_for_opencvs(tmp_path):
+    rng = np.random.default_rng(0)
+    poses = [pose @ np.diag([-1, 1, -1, 1]) for pose in ring(16, 1.0)]  # turned around
+    for pose in poses:
+        pose[:3, 3] += rng.uniform(-0.7, 0.7, 3)
+    said = text(nerfstudio(tmp_path, poses=poses))
+    assert "the cameras look outwards" in said and "OpenCV" not in said and "see the centre" not in said
+
+
 def test_blurred_photos_are_named(tmp_path):
     folder = nerfstudio(tmp_path, count=24)
     rng = np.random.default_rng(0)

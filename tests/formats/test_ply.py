@@ -16,6 +16,7 @@ from refgs.errors import InputError, InputWarning
 from refgs.export.export_job import export
 from refgs.formats.ply import read_ply
 from refgs.formats.splats import read_splats, write_display_splats, write_splats
+from tests.makers import plys
 from tests.makers.splats import arrays, make
 
 COUNT = 50
@@ -286,3 +287,26 @@ def test_the_command_line_converts_them(tmp_path):
         export(source, None, None, None, None, False, lambda event, facts: None)
     with pytest.raises(InputError, match=r"ours\.ply exists"):
         export(ours, None, None, ours, None, False, lambda event, facts: None)
+
+
+@pytest.mark.parametrize("case", plys.READ)
+def test_files_that_the_add_on_reads_too(tmp_path, case):
+    (tmp_path / "a.ply").write_bytes(plys.READ[case]())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        splats = read_splats(tmp_path / "a.ply")
+    rows = np.delete(plys.rows(), plys.LEFT_OUT.get(case, ()))
+    np.testing.assert_array_equal(splats.positions, stacked(rows, "x", "y", "z"))
+    np.testing.assert_array_equal(splats.normals, stacked(rows, "nx", "ny", "nz"))
+    np.testing.assert_allclose(splats.scales, np.exp(stacked(rows, "scale_0", "scale_1")), rtol=1e-6)
+    if case != "others' materials":
+        np.testing.assert_array_equal(splats.albedo, stacked(rows, "albedo_r", "albedo_g", "albedo_b"))
+        np.testing.assert_array_equal(splats.roughness, rows["roughness"])
+
+
+@pytest.mark.parametrize("case", plys.REFUSED)
+def test_files_that_the_add_on_refuses_too(tmp_path, case):
+    (tmp_path / "a.ply").write_bytes(plys.REFUSED[case]())
+    with pytest.raises(InputError, match=r"a\.ply") as said:
+        read_splats(tmp_path / "a.ply")
+    assert "\n" not in str(said.value)

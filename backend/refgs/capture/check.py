@@ -12,6 +12,7 @@ from PIL import Image
 from refgs.capture.cameras import write_cameras
 from refgs.capture.images import LoadedView, load_view
 from refgs.capture.priors import FOLDERS, load_depth, load_normals
+from refgs.capture.region import LOOK_OUT
 from refgs.capture.types import Z_UP, Capture, View
 from refgs.errors import InputError
 from refgs.paths import whole
@@ -209,7 +210,7 @@ def _extent(capture: Capture) -> str:
     centre = capture.to_capture @ np.append(capture.centre, 1)
     radius = capture.radius * np.cbrt(np.linalg.det(capture.to_capture[:3, :3]))
     x, y, z = np.round(centre[:3], 2 - math.floor(math.log10(radius))) + 0.0  # a hundredth of the radius; no −0
-    line = f"Extent: radius {radius:.3g} about ({x:.6g}, {y:.6g}, {z:.6g}) in the capture's frame"
+    line = f"Extent: radius {radius:.3g} about ({x:.15g}, {y:.15g}, {z:.15g}) in the capture's frame"
     return line if capture.points is None else f"{line}, {len(capture.points):,} structure-from-motion points"
 
 
@@ -234,7 +235,8 @@ def _warnings(capture: Capture, statistics: list[_Statistics]) -> list[str]:
     usual = np.median([s.sharpness for s in statistics if s.sharpness > 0] or [0])
     blurred = [view for view, s in pairs if 0 < s.sharpness < BLURRED * usual]
     count("look blurred beside the others", blurred, "look at them, and remove or retake those that are")
-    astray = [view for view in capture.views if not _sees(view, capture.centre)]
+    outwards = capture.bounded_because == LOOK_OUT  # as from a room's middle, which none of them needs to see
+    astray = [view for view in capture.views if not outwards and not _sees(view, capture.centre)]
     count("do not see the centre", astray, "where their cameras are wrong, or they show something else, remove them")
     brightness = [s.brightness for s in statistics if s.coverage != 0]
     if brightness and max(brightness) > 2 * max(1.0, np.median(brightness)):

@@ -11,12 +11,21 @@ import numpy as np
 
 from refgs.camera import Camera
 from refgs.capture.files import Masks, all_found, find_image, photo_view
-from refgs.capture.lens import Lens
+from refgs.capture.lens import BROWN, Lens, check_intrinsics
 from refgs.capture.poses import world_to_camera
 from refgs.capture.transforms import camera_name
 from refgs.capture.types import View
 from refgs.errors import InputError
-from refgs.formats.colmap import SUPPORTED, Image, Intrinsics, model_files, read_cameras, read_images, read_points
+from refgs.formats.colmap import (
+    PARAMETERS,
+    UNDISTORT,
+    Image,
+    Intrinsics,
+    model_files,
+    read_cameras,
+    read_images,
+    read_points,
+)
 
 
 def find_model(folder: Path) -> tuple[Path, Path] | None:
@@ -72,38 +81,44 @@ def capture_root(folder: Path, layout: str) -> Path:
 
 
 def _camera(image: Image, intrinsics: Intrinsics, where: str) -> tuple[Camera, Lens | None]:
-    radial, tangential = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0)
-    match intrinsics.model, intrinsics.params:
-        case "SIMPLE_PINHOLE", (f, cx, cy):
-            fx = fy = f
-        case "PINHOLE", (fx, fy, cx, cy):
-            pass
-        case "SIMPLE_RADIAL", (f, cx, cy, k1):
-            fx, fy, radial = f, f, (k1, 0.0, 0.0, 0.0)
-        case "RADIAL", (f, cx, cy, k1, k2):
-            fx, fy, radial = f, f, (k1, k2, 0.0, 0.0)
-        case "OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2):
-            radial, tangential = (k1, k2, 0.0, 0.0), (p1, p2)
-        case _:
-            raise InputError(
-                f"{where}: COLMAP's camera model {intrinsics.model} is not supported, only {', '.join(SUPPORTED)}. "
-                "Undistort the photos with COLMAP's image_undistorter and use its output."
-            )
-    if not np.isfinite(intrinsics.params).all() or min(fx, fy, intrinsics.width, intrinsics.height) <= 0:
-        raise InputError(f"{where}: focal length or size is zero, negative or NaN. Export the sparse model again.")
+    model, known = intrinsics.model, PARAMETERS.get(intrinsics.model, ())
+    values = dict(zip(known, intrinsics.params, strict=False))
+    if "cx" not in values:
+        raise InputError(f"{where}: COLMAP's camera model {model} is not known as one of a lens. {UNDISTORT}")
+    fx, fy = (values.get(name, values.get("f", 0.0)) for name in ("fx", "fy"))
+    cx, cy = values["cx"], values["cy"]
+    check_intrinsics((intrinsics.width, intrinsics.height), (fx, fy), (cx, cy), where, "Export the sparse model again.")
+    coefficients = intrinsics.params[known.index("cy") + 1 :]
+    if not np.isfinite(coefficients).all():
+        raise InputError(f"{where}: a distortion coefficient is NaN or infinite. Export the sparse model again.")
+    if model in _BROWN:
+        model, coefficients = BROWN, _BROWN[model](*coefficients)
     qw, qx, qy, qz, *translation = image.pose
     rotation = _rotation(np.array([qw, qx, qy, qz]))
     # Via camera-to-world, because `world_to_camera` checks poses.
-    camera_to_world = np.column_stack([rotation.T, -rotation.T @ translation])
+    with np.errstate(over="ignore", invalid="ignore"):
+        camera_to_world = np.column_stack([rotation.T, -rotation.T @ translation])
     pose = world_to_camera(camera_to_world, where)
     name = camera_name(image.name)
     camera = Camera(name, intrinsics.width, intrinsics.height, fx, fy, cx, cy, pose)
-    return camera, Lens(fx, fy, cx, cy, radial, tangential) if any(radial + tangential) else None
+    lens = Lens(fx, fy, cx, cy, model, coefficients)
+    return camera, lens if lens.distorts else None
+
+
+# Coefficients of Brown's model, from those of COLMAP's models that are special cases of it.
+_BROWN = {
+    "SIMPLE_PINHOLE": lambda: (0.0,) * 6,
+    "PINHOLE": lambda: (0.0,) * 6,
+    "SIMPLE_RADIAL": lambda k: (k, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "RADIAL": lambda k1, k2: (k1, k2, 0.0, 0.0, 0.0, 0.0),
+    "OPENCV": lambda k1, k2, p1, p2: (k1, k2, 0.0, 0.0, p1, p2),
+}
 
 
 def _rotation(q: np.ndarray) -> np.ndarray:
     """Convert a quaternion (w, x, y, z) of any length to a rotation matrix. A zero quaternion gives NaN."""
     with np.errstate(invalid="ignore"):
+        q = q / np.abs(q).max()  # first, because squares overflow
         w, x, y, z = q / np.linalg.norm(q)
     return np.array(
         [

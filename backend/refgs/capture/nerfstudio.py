@@ -12,6 +12,7 @@ from refgs.capture.files import find_image
 from refgs.capture.transforms import read_views
 from refgs.capture.types import Split, View
 from refgs.errors import InputError
+from refgs.formats.colmap import FARTHEST
 from refgs.formats.ply import read_ply
 from refgs.formats.transforms import Frame, Transforms, read_transforms
 
@@ -63,5 +64,5 @@ def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     except (KeyError, ValueError, TypeError) as error:
         what = f"it has no points with x, y and z ({error})"
         raise InputError(f"{path}: {what}. Export them again, or remove ply_file_path to do without.") from None
-    good = np.isfinite(points).all(axis=1)
+    good = (np.abs(points) <= FARTHEST).all(axis=1)
     return points[good], colors[good]

@@ -13,6 +13,7 @@ import numpy as np
 from refgs.camera import Camera
 from refgs.capture.files import all_found, photo_view
 from refgs.capture.images import read_header
+from refgs.capture.lens import check_intrinsics
 from refgs.capture.pickles import read_pair
 from refgs.capture.poses import world_to_camera
 from refgs.capture.types import View
@@ -45,8 +46,9 @@ def _camera(file: Path, name: str, width: int, height: int) -> Camera:
     if np.shape(pose) != (3, 4) or np.shape(matrix) != (3, 3):
         raise InputError(f"{file}: not a (3, 4) pose and a (3, 3) intrinsic matrix. Download the data set again.")
     (fx, skew, cx), (_, fy, cy), _ = np.asarray(matrix, float).tolist()
-    if not np.isfinite(matrix).all() or min(fx, fy) <= 0 or abs(skew) > 1e-6 * fx:
+    if not abs(skew) <= 1e-6 * fx:
         raise InputError(f"{file}: the focal length is zero, negative or NaN, or the pixels are skewed. Correct it.")
+    check_intrinsics((width, height), (fx, fy), (cx, cy), str(file), "Correct it.")
     try:
         inverse = np.linalg.inv(np.vstack([pose, [0, 0, 0, 1]]))
     except np.linalg.LinAlgError:

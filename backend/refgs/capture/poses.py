@@ -6,6 +6,7 @@ import numpy as np
 
 from refgs.camera import Camera
 from refgs.errors import InputError
+from refgs.formats.colmap import FARTHEST
 
 # OpenGL camera axes (y up, looking along −z) to OpenCV's (y down, looking along +z), and back.
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -28,10 +29,16 @@ def world_to_camera(camera_to_world: object, where: str) -> np.ndarray:
     if not np.isfinite(matrix).all():
         raise InputError(f"{where}: the pose holds NaN or infinity. {advice}")
     rotation, position = matrix[:3, :3], matrix[:3, 3]
+    if np.abs(position).max() > FARTHEST:
+        raise InputError(
+            f"{where}: the pose is {np.abs(position).max():.3g} from the origin, which is too far. {advice}"
+        )
     u, stretch, vt = np.linalg.svd(rotation)
-    if stretch[2] <= 1e-9 * stretch[0] or (len(matrix) == 4 and not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)):
+    if stretch[2] <= max(1e-9 * stretch[0], 1e-100) or (
+        len(matrix) == 4 and not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)
+    ):
         raise InputError(f"{where}: the pose matrix cannot be inverted to a rigid pose. {advice}")
-    if np.linalg.det(rotation) < 0:
+    if np.linalg.det(u @ vt) < 0:
         raise InputError(f"{where}: the pose is left-handed (it mirrors the world). {advice}")
     if stretch[0] > 1.01 * stretch[2]:
         raise InputError(f"{where}: the pose stretches or skews by {stretch[0] / stretch[2] - 1:.0%}. {advice}")

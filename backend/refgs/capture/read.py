@@ -25,6 +25,7 @@ from refgs.capture.region import (
     run_frame,
     sample_silhouettes,
     up_direction,
+    warn_of_axes,
 )
 from refgs.capture.stanford_orb import NOVEL, read_stanford_orb
 from refgs.capture.tensoir import is_tensoir, read_tensoir
@@ -104,7 +105,7 @@ def to_run_frame(files: CaptureFiles, wanted: RegionSettings | None = None) -> C
         reach=reach,
         box=box,
         digest=_digest(folder, layout, views),
-        warnings=[*files.warnings, *white],
+        warnings=[*files.warnings, *white, *warn_of_axes(layout, views)],
     )
     return capture if np.array_equal(to_capture, np.eye(4)) else _in_run_frame(capture, unit)
 
@@ -181,7 +182,8 @@ def _check_cameras(folder: Path, views: list[View]) -> None:
             "At least three are needed, thirty or more are good: add photos."
         )
     positions = np.array([view.camera.position for view in train])
-    if np.ptp(positions, axis=0).max() <= 1e-6 * np.abs(positions).max():
+    # Relative to float64's resolution, not to the distance from the origin: map coordinates have an origin far away.
+    if np.ptp(positions, axis=0).max() <= 1e-12 * max(1.0, np.abs(positions).max()):
         raise InputError(f"{folder}: all cameras are in one place, so no depth can be seen. Photograph from around it.")
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from refgs.capture.box import Box
 from refgs.capture.images import read_alpha
+from refgs.capture.poses import in_frame
 from refgs.capture.types import View
 from refgs.errors import InputError
 from refgs.geometry.project import inside, project
@@ -80,7 +81,11 @@ def region_in(box: Box, views: list[View], silhouettes: list[tuple[View, np.ndar
     If there are no masks, or nothing in the box fits them, return the ball around the box. `silhouettes` are the pairs that
     `sample_silhouettes` returns. Raises InputError if no photo shows the box.
     """
-    if not any(inside(view.camera, *project(view.camera, box.grid(5))).any() for view in views):
+    # About the box's centre, because `project` has 32 bits.
+    to_box = np.eye(4)
+    to_box[:3, 3] = -box.centre
+    cameras = [in_frame(view.camera, to_box) for view in views]
+    if not any(inside(camera, *project(camera, box.grid(5) - box.centre)).any() for camera in cameras):
         raise InputError("no photo shows the region: put its box where the cameras look")
     carved = _carve(silhouettes, box.centre, box.radius, box) if silhouettes else None
     return Region(*(carved or (box.centre, box.radius)), True, "a region was asked for")
@@ -93,15 +98,30 @@ def look_at_centre(views: list[View]) -> tuple[np.ndarray, np.ndarray, float]:
     divided by the median depth. If the axes are parallel, the point stays finite, because it is pulled slightly towards the cameras.
     """
     positions = np.array([view.camera.position for view in views])
+    middle = positions.mean(axis=0)
+    positions = positions - middle  # first, because map coordinates have an origin far away
     forward = np.array([view.camera.world_to_camera[2, :3] for view in views])
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     pull = 1e-4 * len(views) * np.eye(3)
-    middle = positions.mean(axis=0)
-    centre = np.linalg.solve(across.sum(axis=0) + pull, np.einsum("nij,nj->i", across, positions) + pull @ middle)
+    centre = np.linalg.solve(across.sum(axis=0) + pull, np.einsum("nij,nj->i", across, positions))
     offset = centre - positions
     depth = np.einsum("ni,ni->n", forward, offset)
     miss = np.linalg.norm(np.einsum("nij,nj->ni", across, offset), axis=1)
-    return centre, depth, float(np.median(miss) / max(np.median(np.abs(depth)), 1e-12))
+    return centre + middle, depth, float(np.median(miss) / max(np.median(np.abs(depth)), 1e-300))
+
+
+def warn_of_axes(layout: str, views: list[View]) -> list[str]:
+    """Return a warning if a JSON file's axes look like OpenCV's: the cameras look away from the place where their optical axes meet.
+
+    Cameras that look out of a room hardly do: their axes miss each other. A rig may, so the file is read as its format says all the same.
+    """
+    _, depth, miss = look_at_centre(views)
+    if layout not in ("nerfstudio", "nerf-blender") or (depth < 0).mean() < 0.75 or miss > 0.25:
+        return []
+    what = f"{(depth < 0).sum()} of {len(views)} cameras look away from where their axes meet, as if the file had OpenCV's axes"
+    return [
+        f'{what}, not OpenGL\'s. If the photos show an object from around it, add "camera_convention": "opencv" to the file'
+    ]
 
 
 def up_direction(views: list[View]) -> np.ndarray:
@@ -221,7 +241,7 @@ def _inside_masks(
     for view, mask in silhouettes:
         camera = view.camera.resized(mask.shape[1], mask.shape[0])
         local = grid @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        z = np.maximum(local[:, 2], 1e-9)
+        z = np.where(local[:, 2] > 0, local[:, 2], 1.0)
         u, v = camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy
         visible = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         seen += visible
@@ -238,7 +258,7 @@ def _foreground(views: list[View], points: np.ndarray, centre: np.ndarray, radiu
     for view in views:
         camera = view.camera
         local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        z = np.maximum(local[:, 2], 1e-9)
+        z = np.where(local[:, 2] > 0, local[:, 2], 1.0)
         u, v = camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy
         seen += (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     near = points[(seen >= 0.5 * len(views)) & (np.linalg.norm(points - centre, axis=1) < 2 * radius)]

@@ -1,6 +1,6 @@
 """Read cameras and photos from the JSON format that NeRF-Blender, instant-ngp and nerfstudio share (`refgs.formats.transforms`).
 
-Poses are camera-to-world with OpenGL's axes.
+Poses are camera-to-world with OpenGL's axes, or with those that the key `camera_convention` names.
 """
 
 import math
@@ -11,10 +11,11 @@ import numpy as np
 from refgs.camera import Camera
 from refgs.capture.files import IMAGE_SUFFIXES, Masks, all_found, find_image, photo_view
 from refgs.capture.images import read_header
-from refgs.capture.lens import Lens
+from refgs.capture.lens import BROWN, Lens, check_intrinsics
 from refgs.capture.poses import OPENGL_TO_OPENCV, world_to_camera
 from refgs.capture.types import Split, View
 from refgs.errors import InputError
+from refgs.formats.colmap import PARAMETERS
 from refgs.formats.transforms import Frame
 
 
@@ -28,8 +29,7 @@ def frame_camera(frame: Frame, where: str, image_size: tuple[int, int] | None = 
 
     `image_size` (width, height) is used if the frame gives no size. Raises InputError, which begins with `where`, a name for the frame.
     """
-    if frame.is_fisheye or (frame.camera_model or "").upper() in _NOT_PERSPECTIVE:
-        raise InputError(f"{where}: the camera is not a perspective one. Undistort the photos to pinholes first.")
+    model, coefficients = _lens_model(frame, where)
     width, height = frame.w, frame.h
     if width is None or height is None:
         if image_size is None:
@@ -41,17 +41,65 @@ def frame_camera(frame: Frame, where: str, image_size: tuple[int, int] | None = 
     if fx is None or fy is None:
         raise InputError(f"{where}: no focal length. Add fl_x (pixels) or camera_angle_x (radians) to the file.")
     cx, cy = width / 2 if frame.cx is None else frame.cx, height / 2 if frame.cy is None else frame.cy
-    finite = all(math.isfinite(x) for x in (fx, fy, cx, cy, width, height))
-    if not finite or min(fx, fy) <= 0 or round(min(width, height)) < 1:
-        raise InputError(f"{where}: focal length or size is zero, negative or NaN. Correct the file.")
-    pose = world_to_camera(_from_opengl(frame), where)
+    check_intrinsics((width, height), (fx, fy), (cx, cy), where, "Correct the file.")
+    pose = world_to_camera(_camera_to_world(frame, where), where)
     camera = Camera(camera_name(frame.path), round(width), round(height), fx, fy, cx, cy, pose)
-    k1, k2, k3, k4, p1, p2 = (value or 0.0 for value in (frame.k1, frame.k2, frame.k3, frame.k4, frame.p1, frame.p2))
-    if not all(math.isfinite(x) for x in (k1, k2, k3, k4, p1, p2)):
-        raise InputError(f"{where}: a distortion coefficient is NaN or infinite. Correct the file.")
-    if not any((k1, k2, k3, k4, p1, p2)):
-        return camera, None
-    return camera, Lens(fx, fy, cx, cy, (k1, k2, k3, k4), (p1, p2))
+    lens = Lens(fx, fy, cx, cy, model, coefficients)
+    return camera, lens if lens.distorts else None
+
+
+# Models by `camera_model`, and the keys of their coefficients in COLMAP's order. nerfstudio has one model for all words of the first line.
+_PERSPECTIVE = ("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+_MODELS = {word: (BROWN, ("k1", "k2", "k3", "k4", "p1", "p2")) for word in _PERSPECTIVE} | {
+    "FULL_OPENCV": ("FULL_OPENCV", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "SIMPLE_FISHEYE": ("FISHEYE", ()),
+    "FISHEYE": ("FISHEYE", ()),
+    "SIMPLE_RADIAL_FISHEYE": ("SIMPLE_RADIAL_FISHEYE", ("k1",)),
+    "RADIAL_FISHEYE": ("RADIAL_FISHEYE", ("k1", "k2")),
+    "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
+    "THIN_PRISM_FISHEYE": ("THIN_PRISM_FISHEYE", PARAMETERS["THIN_PRISM_FISHEYE"][4:]),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ("RAD_TAN_THIN_PRISM_FISHEYE", PARAMETERS["RAD_TAN_THIN_PRISM_FISHEYE"][4:]),
+    "FOV": ("FOV", ("omega",)),
+}
+_UNDISTORT = "Undistort the photos to pinholes, and export their cameras again."
+
+
+def _lens_model(frame: Frame, where: str) -> tuple[str, tuple[float, ...]]:
+    """Return the name and the coefficients of a frame's lens model (see `Lens`).
+
+    Raises InputError for a model that is not known, and for a coefficient or another statement about the lens that the model has not.
+    """
+    word = (frame.camera_model or ("OPENCV_FISHEYE" if frame.is_fisheye else "OPENCV")).upper()
+    if word not in _MODELS:
+        raise InputError(f"{where}: camera_model is {frame.camera_model}, which is not known. {_UNDISTORT}")
+    if frame.is_fisheye and word in (*_PERSPECTIVE, "FULL_OPENCV"):
+        raise InputError(f"{where}: is_fisheye is true, but camera_model is {frame.camera_model}. Correct the file.")
+    model, keys = _MODELS[word]
+    said = frame.lens_keys
+    for key, value in said.items():
+        if key not in keys and not _says_perspective(value):
+            raise InputError(f"{where}: {key} is {str(value)[:60]}, which is not known of a lens {word}. {_UNDISTORT}")
+    values = [0.0 if said.get(key) is None else said[key] for key in keys]
+    for key, value in zip(keys, values, strict=True):
+        if isinstance(value, bool) or not isinstance(value, float | int):
+            raise InputError(f"{where}: {key} should be a valid number. Export the cameras again, or correct the file.")
+        if not abs(value) <= _LARGEST:
+            raise InputError(f"{where}: the distortion coefficient {key} is {str(value)[:20]}. Correct the file.")
+    if keys and keys[0] in ("k0", "omega") and keys[0] not in said:  # other programs count from k1
+        raise InputError(f"{where}: {keys[0]} is missing, a coefficient of {word}. Add it to the file.")
+    return model, tuple(map(float, values))
+
+
+_LARGEST = 1e9  # of a coefficient: those of r⁸ are large for long lenses
+
+
+def _says_perspective(value: object) -> bool:
+    """Tell whether a value of an unknown key about the lens changes nothing: it is zero, empty, false, or a word for perspective."""
+    if isinstance(value, str):
+        return value.upper() in ("", "NONE", *_PERSPECTIVE)
+    if isinstance(value, list | dict):
+        return not any(value.values() if isinstance(value, dict) else value)
+    return not value
 
 
 def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> list[View]:
@@ -78,9 +126,6 @@ def camera_name(path: str) -> str:
     return stem if dot and f".{suffix.lower()}" in IMAGE_SUFFIXES else name
 
 
-_NOT_PERSPECTIVE = {"OPENCV_FISHEYE", "FISHEYE", "FISHEYE624", "EQUIRECTANGULAR", "ORTHOPHOTO"}
-
-
 def _focal(focal: float | None, angle: float | None, size: float) -> float | None:
     """Return `focal`, a focal length in pixels. If it is None, compute it from the angle of view over `size` pixels, in radians.
 
@@ -91,9 +136,17 @@ def _focal(focal: float | None, angle: float | None, size: float) -> float | Non
     return size / 2 / math.tan(angle / 2) if 0 < angle < math.pi else math.nan
 
 
-def _from_opengl(frame: Frame) -> np.ndarray | None:
+_CONVENTIONS = {"opengl": OPENGL_TO_OPENCV, "blender": OPENGL_TO_OPENCV, "opencv": np.eye(4), "colmap": np.eye(4)}
+
+
+def _camera_to_world(frame: Frame, where: str) -> np.ndarray | None:
+    """Return a frame's camera-to-world matrix with OpenCV's axes. It has OpenGL's unless the key `camera_convention` tells others."""
+    convention = frame.camera_convention or "opengl"
+    if convention.lower() not in _CONVENTIONS:
+        known = ", ".join(_CONVENTIONS)
+        raise InputError(f"{where}: camera_convention is {convention}, which is not known, only {known}. Correct it.")
     try:
         with np.errstate(invalid="ignore"):  # `world_to_camera` reports infinity
-            return np.array(frame.transform_matrix, dtype=np.float64) @ OPENGL_TO_OPENCV
+            return np.array(frame.transform_matrix, dtype=np.float64) @ _CONVENTIONS[convention.lower()]
     except ValueError:  # rows of different lengths, or not of four
         return None

@@ -18,23 +18,33 @@ from refgs.errors import InputError
 
 T = TypeVar("T")
 
-# COLMAP's "Camera Models": number, name, count of parameters. Text files use the names.
+UNDISTORT = "Undistort the photos with COLMAP's image_undistorter and use its output."
+
+# COLMAP's "Camera Models": number, name, parameters. Text files use the names.
 MODELS = {
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8),
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
+    0: ("SIMPLE_PINHOLE", "f cx cy"),
+    1: ("PINHOLE", "fx fy cx cy"),
+    2: ("SIMPLE_RADIAL", "f cx cy k"),
+    3: ("RADIAL", "f cx cy k1 k2"),
+    4: ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
+    5: ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4"),
+    6: ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    7: ("FOV", "fx fy cx cy omega"),
+    8: ("SIMPLE_RADIAL_FISHEYE", "f cx cy k"),
+    9: ("RADIAL_FISHEYE", "f cx cy k1 k2"),
+    10: ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3"),
+    12: ("SIMPLE_DIVISION", "f cx cy k"),
+    13: ("DIVISION", "fx fy cx cy k"),
+    14: ("SIMPLE_FISHEYE", "f cx cy"),
+    15: ("FISHEYE", "fx fy cx cy"),
+    16: ("EUCM", "fx fy cx cy alpha beta"),
+    17: ("EQUIRECTANGULAR", "w h"),
 }
+PARAMETERS = {name: tuple(parameters.split()) for name, parameters in MODELS.values()}
+FARTHEST = 1e12  # largest coordinate: beyond it, float64 does not resolve an object of 1 unit well
 LONGEST_NAME = 4096  # bytes of a photo's path
 LARGEST_TEXT = 2 << 30  # bytes of a text file; a model of 1,000 photos has 200 MB
-SUPPORTED = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
 @dataclass(frozen=True)
@@ -75,7 +85,7 @@ def read_images(file: Path) -> list[Image]:
 def read_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read the points (M, 3) of a COLMAP model and their colours (M, 3), sRGB-encoded in 0..1. Raises InputError for a broken file.
 
-    Points with a NaN or infinite value are left out.
+    Points with a value that is NaN, infinite or beyond FARTHEST are left out: no camera is there.
     """
     return _parse(file, _binary_points, _text_points)
 
@@ -123,11 +133,11 @@ def _binary_cameras(file: Path) -> dict[int, Intrinsics]:
     for _ in range(source.take("Q")[0]):
         number, model, width, height = source.take("iiQQ")
         if model not in MODELS:
-            raise InputError(f"{file}: camera model number {model} is not supported, only {', '.join(SUPPORTED)}.")
+            raise InputError(f"{file}: camera model number {model} is not known. {UNDISTORT}")
         if number in cameras:
             raise ValueError("not COLMAP's")
-        name, count = MODELS[model]
-        cameras[number] = Intrinsics(name, width, height, source.take(f"{count}d"))
+        name = MODELS[model][0]
+        cameras[number] = Intrinsics(name, width, height, source.take(f"{len(PARAMETERS[name])}d"))
     return cameras
 
 
@@ -156,22 +166,19 @@ def _binary_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _points(rows: list) -> tuple[np.ndarray, np.ndarray]:
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
-    table = table[np.isfinite(table).all(axis=1)]
+    table = table[(np.abs(table) <= FARTHEST).all(axis=1)]
     return table[:, :3], table[:, 3:] / 255.0
 
 
-def _entries(file: Path, lines_each: int = 1) -> list[str]:
-    """Split a COLMAP text file into entries of `lines_each` lines. Return the first line of each entry.
+def _entries(file: Path, first: Callable[[str], bool] = lambda line: True) -> list[str]:
+    """Return the lines of a COLMAP text file that `first` says begin an entry, without comments and empty lines.
 
     Raises ValueError if the file has fewer entries than its header says.
     """
     if file.stat().st_size > LARGEST_TEXT:
         raise ValueError("larger than such a file can be")
     lines = file.read_text(encoding="utf-8").splitlines()
-    entries = [line for line in lines if not line.startswith("#") and (lines_each > 1 or line.strip())]
-    while entries and not entries[-1].strip():  # the line of keypoints may be empty
-        entries.pop()
-    entries = entries[::lines_each]
+    entries = [line for line in lines if line.strip() and not line.startswith("#") and first(line)]
     counted = next((match for line in lines if (match := re.match(r"# Number of \w+: (\d+)", line))), None)
     if counted and len(entries) < int(counted[1]):
         raise ValueError("fewer entries than counted")
@@ -182,7 +189,7 @@ def _text_cameras(file: Path) -> dict[int, Intrinsics]:
     cameras = {}
     for line in _entries(file):
         number, model, width, height, *params = line.split()
-        if len(params) != dict(MODELS.values()).get(model, len(params)):
+        if len(params) != len(PARAMETERS.get(model, params)):
             raise ValueError("parameters missing")
         cameras[int(number)] = Intrinsics(model, int(width), int(height), tuple(map(float, params)))
     return cameras
@@ -190,12 +197,27 @@ def _text_cameras(file: Path) -> dict[int, Intrinsics]:
 
 def _text_images(file: Path) -> list[Image]:
     images = []
-    for line in _entries(file, lines_each=2):  # the second line holds keypoints
+    for line in _entries(file, _is_image):
         _, *pose, camera_id, name = line.split(maxsplit=9)
         if len(pose) != 7:
             raise ValueError("numbers missing")
         images.append(Image(name.strip(), int(camera_id), tuple(map(float, pose))))
     return images
+
+
+def _is_image(line: str) -> bool:
+    """Tell a line of an image from its line of keypoints, which may be empty, and which some programs leave out.
+
+    Keypoints are triples of numbers; an image ends in its name. Raises ValueError for a line that is neither.
+    """
+    values = line.split()
+    try:
+        float(values[-1])
+    except ValueError:
+        return True
+    if len(values) != 10 and len(values) % 3:
+        raise ValueError("numbers missing")
+    return len(values) == 10  # the image's name is a number
 
 
 def _text_points(file: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -69,7 +69,7 @@ _DOUBT = "doubt"
 _MATERIAL = ["albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"]
 # `specular` is the Principled BSDF's Specular IOR Level. Its default is 0.5.
 CONSTANTS = ("metallic", "roughness", "specular")
-_CONSTANT = re.compile(rf"constant ({'|'.join(CONSTANTS)}) ([0-9.e+-]+)")  # in a comment of the header
+_CONSTANT = re.compile(rf"constant\s+({'|'.join(CONSTANTS)})\s+(\S+)")  # in a comment of the header
 # Properties of Ref-Gaussian's files, as logits.
 _REF_GAUSSIAN = ["ori_color_0", "ori_color_1", "ori_color_2", "refl_strength", "roughness"]
 MATTE = 0.0, 1.0  # metallic and roughness of splats without materials
@@ -181,7 +181,7 @@ def read_splats(path: str | os.PathLike) -> Splats:
         raise InputError(f"{path} is a compressed PLY: make a plain one of it, with splat-transform or SuperSplat")
     ours = not {*_MATERIAL[:4]}.isdisjoint(names)
     found = [_CONSTANT.fullmatch(comment.strip()) for comment in data.comments] if ours else []
-    constants = {match[1]: float(match[2]) for match in found if match and match[1] not in names}
+    constants = {match[1]: _constant(match, path) for match in found if match and match[1] not in names}
     material = [name for name in _MATERIAL if name not in constants]
     normals = {*_HEAD[3:6]} <= {*names}
     needed = [*_HEAD, *_TAIL, *(material if ours else [])]
@@ -213,6 +213,7 @@ def read_splats(path: str | os.PathLike) -> Splats:
         scales = np.exp(columns(*(name for name in ("scale_0", "scale_1", "scale_2") if name in names)))
         rotations = columns("rot_0", "rot_1", "rot_2", "rot_3")
         length = np.linalg.norm(rotations, axis=1, keepdims=True)
+        length[np.isinf(length)] = np.nan  # whose quotient would be zero
         rotations = np.where(np.abs(length - 1) < 1e-4, rotations, rotations / length)  # keep the bits of unit ones
         if scales.shape[1] == 3:
             rotations, scales = _shortest_last(rotations, scales)
@@ -247,6 +248,16 @@ def read_splats(path: str | os.PathLike) -> Splats:
     splats.normals[none] = _third_axis(rotations[none])
     splats.others = _other_elements(data.elements, known)
     return _without_nonfinite(splats, Path(path))
+
+
+def _constant(match: re.Match, path: str | os.PathLike) -> float:
+    try:
+        value = float(match[2])
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"{path}: {match[1]} is {match[2]}, not a number: export it again")
+    return value
 
 
 def _logistic(values: np.ndarray) -> np.ndarray:

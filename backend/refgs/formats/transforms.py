@@ -1,15 +1,16 @@
 """Describe the JSON format that NeRF-Blender, instant-ngp, nerfstudio and a run's cameras.json share: a list `frames` of cameras.
 
-Intrinsics (`fl_x fl_y cx cy w h`, or `camera_angle_x` and `camera_angle_y` in radians) and distortion (`k1 k2 k3 k4 p1 p2`) are given for
-all frames at the file's top level, or in a frame. If both are given, the frame's value is used. The format is documented in nerfstudio's
-"Data conventions" and instant-ngp's "Tips for training NeRF models". instant-ngp's keys `scale` and `offset` are ignored: they only place
-the scene in its unit cube.
+Intrinsics (`fl_x fl_y cx cy w h`, or `camera_angle_x` and `camera_angle_y` in radians) and the lens (`camera_model`, `is_fisheye`, and
+coefficients such as `k1` and `p1`) are given for all frames at the file's top level, or in a frame. If both are given, the frame's value is
+used. The format is documented in nerfstudio's "Data conventions" and instant-ngp's "Tips for training NeRF models". instant-ngp's keys
+`scale` and `offset` are ignored: they only place the scene in its unit cube.
 """
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from refgs.formats.validate import Finite, Matrix, Model, Number, Vector, read_json
 
@@ -20,6 +21,8 @@ Positive = Annotated[Finite, Field(gt=0)]
 class Intrinsics(Model):
     """Hold the intrinsics of a camera. Focal lengths, principal point and size are in pixels. A value that is not given is None."""
 
+    model_config = ConfigDict(extra="allow")
+
     fl_x: Number | None = None
     fl_y: Number | None = None
     camera_angle_x: Number | None = None
@@ -28,14 +31,27 @@ class Intrinsics(Model):
     cy: Number | None = None
     w: Number | None = None
     h: Number | None = None
-    k1: Number | None = None
-    k2: Number | None = None
-    k3: Number | None = None
-    k4: Number | None = None
-    p1: Number | None = None
-    p2: Number | None = None
     camera_model: str | None = None
     is_fisheye: bool | None = None
+    camera_convention: str | None = None
+
+    @property
+    def lens_keys(self) -> dict[str, Any]:
+        """Return all that the file says of the lens besides `camera_model` and `is_fisheye`: each key that is named like it."""
+        return {key: value for key, value in (self.model_extra or {}).items() if _of_lens(key)}
+
+
+# Distortion coefficients of any program, and keys of other projections than the perspective. "undistorted" is no such key.
+_LENS_KEYS = re.compile(
+    r"(k|p|s|b|sx|sy|tx|ty|tau|xi|radial|tangential|ftheta_?p)_?\d+|t[12]|omega|xi|skew"
+    r"|(camera|cam|lens|distortion)_?(type|projection)|(cam|distortion)_?model|projection(_?(type|model))?"
+    r"|(?!undistort).*(distort|fisheye|f_?theta|lat_?long|equirect|ortho(graph|photo)|spheric|panoram|omnidirect|cylindr).*",
+    re.IGNORECASE,
+)
+
+
+def _of_lens(key: str) -> bool:
+    return _LENS_KEYS.fullmatch(key) is not None
 
 
 class Frame(Intrinsics):
@@ -66,7 +82,7 @@ class _Cameras(Model):
         """Copy the intrinsics at the file's top level into each frame that does not give them itself."""
         if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
             return data
-        shared = {key: data[key] for key in Intrinsics.model_fields if key in data}
+        shared = {key: value for key, value in data.items() if key in Intrinsics.model_fields or _of_lens(key)}
         frames = [{**shared, **frame} if isinstance(frame, dict) else frame for frame in data["frames"]]
         return {**data, "frames": frames}
 
