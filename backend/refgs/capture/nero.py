@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from refgs.camera import Camera
-from refgs.capture.files import all_found, photo_view
+from refgs.capture.files import leave_out_missing, photo_view
 from refgs.capture.images import read_header
 from refgs.capture.pickles import read_pair
 from refgs.capture.poses import world_to_camera
@@ -27,17 +27,20 @@ def read_nero(folder: Path) -> tuple[list[View], list[str]]:
     names = (file.name.removesuffix("-camera.pkl") for file in folder.glob("*-camera.pkl"))
     numbers = sorted(int(name) for name in names if name.isdecimal())
     named = [folder / f"{number}.png" for number in numbers]
-    photos = all_found(folder, [(photo.name, photo if photo.is_file() else None) for photo in named])
+    found = [
+        (number, photo.name, photo if photo.is_file() else None) for number, photo in zip(numbers, named, strict=True)
+    ]
+    photos, lost = leave_out_missing(folder, found)
     tested, warnings = _test_numbers(folder, numbers)
     views = []
-    for number, photo in zip(numbers, photos, strict=True):
+    for number, photo in photos:
         file = folder / f"{number}-camera.pkl"
         depth = folder / f"{number}-depth.png"
         split = "test" if number in tested else "train"
         camera = _camera(file, str(number), *read_header(photo)[:2])
         mask, below = (depth, FAR) if depth.is_file() else (None, None)
         views.append(photo_view(photo, (camera, None), split, mask, str(file), mask_below=below))
-    return views, warnings
+    return views, [*warnings, *lost]
 
 
 def _camera(file: Path, name: str, width: int, height: int) -> Camera:

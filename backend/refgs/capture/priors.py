@@ -68,7 +68,7 @@ def _find(views: list[View], root: Path, folder: Path) -> dict[View, Path]:
                     others.append(view)
     found: dict[View, list[Path]] = {}
     for file in sorted(folder.rglob("*")):
-        if file.suffix.lower() in SUFFIXES:
+        if file.suffix.lower() in SUFFIXES and not file.name.startswith("."):
             name = file.relative_to(folder).as_posix().removesuffix(file.suffix)
             while name not in named and (shorter := re.sub(r"[-_.][^-_./]*$", "", name)) != name:
                 name = shorter

@@ -69,6 +69,11 @@ def read_images(file: Path) -> list[Image]:
     return _parse(file, _binary_images, _text_images)
 
 
+def count_images(file: Path) -> int:
+    """Count a COLMAP model's images, as `read_images` would read them. Raises InputError for a broken file."""
+    return _parse(file, lambda file: _Reader(file).take("Q")[0], lambda file: len(_text_images(file)))
+
+
 def read_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read the points (M, 3) of a COLMAP model and their colours (M, 3), sRGB-encoded in 0..1. Raises InputError for a broken file.
 
@@ -146,20 +151,29 @@ def _points(rows: list) -> tuple[np.ndarray, np.ndarray]:
     return table[:, :3], table[:, 3:] / 255.0
 
 
-def _entries(file: Path, lines_each: int = 1) -> list[str]:
-    """Split a COLMAP text file into entries of `lines_each` lines. Return the first line of each entry.
+def _entries(file: Path, images: bool = False) -> list[str]:
+    """Return the lines of a COLMAP text file that are no comments, one an entry. Lines of images' keypoints are left out.
 
     Raises ValueError if the file has fewer entries than its header says.
     """
     lines = file.read_text(encoding="utf-8").splitlines()
-    entries = [line for line in lines if not line.startswith("#") and (lines_each > 1 or line.strip())]
-    while entries and not entries[-1].strip():  # the line of keypoints may be empty
-        entries.pop()
-    entries = entries[::lines_each]
+    entries = [line for line in lines if line.strip() and not line.startswith("#")]
+    if images:
+        entries = [line for line in entries if not _is_keypoints(line)]
     counted = next((match for line in lines if (match := re.match(r"# Number of \w+: (\d+)", line))), None)
     if counted and len(entries) < int(counted[1]):
         raise ValueError("fewer entries than counted")
     return entries
+
+
+def _is_keypoints(line: str) -> bool:
+    """Tell a line of an image's keypoints, which are x, y and a point's id each, from a line of an image, which ends with its name."""
+    words = line.split()
+    try:
+        [float(word) for word in words[-3:]]
+    except ValueError:
+        return False
+    return len(words) % 3 == 0
 
 
 def _text_cameras(file: Path) -> dict[int, Intrinsics]:
@@ -174,7 +188,7 @@ def _text_cameras(file: Path) -> dict[int, Intrinsics]:
 
 def _text_images(file: Path) -> list[Image]:
     images = []
-    for line in _entries(file, lines_each=2):  # the second line holds keypoints
+    for line in _entries(file, images=True):  # some programs leave out the keypoints' lines
         _, *pose, camera_id, name = line.split(maxsplit=9)
         if len(pose) != 7:
             raise ValueError("numbers missing")
