@@ -6,6 +6,7 @@ from pathlib import Path
 from refgs.capture.colmap import capture_root
 from refgs.capture.files import PHOTO_FOLDERS, Files, fold, photos_in, without_suffix
 from refgs.capture.mask_files import mask_folders
+from refgs.capture.region import WHITE_MASKS
 from refgs.capture.types import Capture
 
 _LIKE_MASKS = re.compile(r"mask|matte|alpha|silhouette|segment", re.IGNORECASE)
@@ -17,6 +18,8 @@ def not_used(capture: Capture) -> list[str]:
     lines = []
     if capture.layout != "tensoir" and (photos := _without_camera(capture, files)):
         lines.append(f"{_count(photos, 'photo')} without a camera, first {_name(files, photos[0])}")
+    if WHITE_MASKS in capture.warnings:  # no view has its mask then
+        return lines
     used = {view.mask_path for view in capture.views}
     read = [] if capture.layout in ("nero", "tensoir") else mask_folders(files, [v.image_path for v in capture.views])
     for folder in files.folders(files.folder):
