@@ -224,6 +224,27 @@ def test_a_removed_photo_leaves_its_camera_out(tmp_path, make):
     assert_sees_the_ball(capture)
 
 
+@pytest.mark.parametrize("keep", ["none", "empty", "some", "numbers"])
+def test_colmap_text_without_keypoints(tmp_path, keep):
+    """Check images.txt without the lines of keypoints, with empty ones, and with photos whose names look like keypoints."""
+    folder = colmap(tmp_path, binary=False)
+    file = folder / "sparse" / "0" / "images.txt"
+    lines = [line for line in file.read_text().splitlines() if line.endswith(".png")]
+    between = {"none": [], "empty": [""], "some": ["1 2 -1 3 4 5"], "numbers": ["1 2 -1"]}[keep]
+    if keep == "some":
+        lines[3] += "\n1.5 2.5 77"
+    if keep == "numbers":
+        for i in range(16):
+            lines[i] = lines[i].replace(".png", "" if i % 2 else " 7 8.png")
+            (folder / "images" / f"{i:04d}.png").rename(
+                folder / "images" / (f"{i:04d}.png" if i % 2 else f"{i:04d} 7 8.png")
+            )
+    file.write_text("\n".join(line for image in lines for line in [image, *between]) + "\n")
+    capture = read_capture(folder)
+    assert len(capture.views) == 16
+    assert_sees_the_ball(capture)
+
+
 def test_nerfstudio_points(tmp_path):
     folder = nerfstudio(tmp_path)
     rows = np.zeros(30, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
