@@ -173,7 +173,16 @@ def test_photos_in_subfolders(tmp_path):
     for name in ("cam2/IMG_1.jpg", "cam1/IMG_2.avif", "cam1/IMG_1.jfif", "IMG_0.JPG", "cam1/deep/a.png"):
         (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "images" / name).touch()
-    for name in (".cache/a.jpg", "._IMG_0.JPG", "__MACOSX/IMG_0.JPG", "Thumbs.db", "cam1/._IMG_1.jfif", ".DS_Store"):
+    for name in (
+        ".cache/a.jpg",
+        "._IMG_0.JPG",
+        "masks/IMG_0.png",
+        "cam1/Mask/IMG_1.png",
+        "__MACOSX/IMG_0.JPG",
+        "Thumbs.db",
+        "cam1/._IMG_1.jfif",
+        ".DS_Store",
+    ):
         (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "images" / name).touch()
     (tmp_path / "images" / "circle").symlink_to(tmp_path / "images")

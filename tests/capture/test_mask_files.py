@@ -41,6 +41,8 @@ def matched(folder, *names: str) -> dict[str, str]:
         "images/0001_alpha.png",
         "images/0001.jpg.mask.png",
         "images/mask_0001.png",
+        "images/masks/0001.png",
+        "images/Mask/0001.jpg.mask.png",
         "images/0001_mask.webp",
     ],
 )
@@ -79,6 +81,11 @@ def test_masks_of_photos_in_subfolders(tmp_path):
     masks = [photo.replace("images", "masks").replace(".jpg", "_mask.png") for photo in photos]
     assert matched(tmp_path / "a", *photos, *masks[1:]) == dict(zip(photos[1:], masks[1:], strict=True))
     assert matched(tmp_path / "b", *photos, "masks/0001.png", "masks/0002.png") == {}  # of which camera?
+    apart = [f"cam{camera}/images/000{i}.jpg" for camera in (1, 2) for i in (1, 2)]
+    beside = [photo.replace("images", "masks").replace(".jpg", ".png") for photo in apart]
+    assert matched(tmp_path / "e", *apart, *beside) == dict(zip(apart, beside, strict=True))
+    inner = [photo.replace("/000", "/masks/000").replace(".jpg", ".png") for photo in photos]
+    assert matched(tmp_path / "d", *photos, *inner) == dict(zip(photos, inner, strict=True))
     photos[2:] = ["images/cam2/0003.jpg", "images/cam2/0004.jpg"]
     flat = ["masks/0001.png", "masks/0002_mask.png", "masks/0003.jpg.mask.png"]
     assert matched(tmp_path / "c", *photos, *flat) == dict(zip(photos[:3], flat, strict=True))

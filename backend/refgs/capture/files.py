@@ -22,6 +22,13 @@ T = TypeVar("T")
 PICTURE_SUFFIXES = tuple(suffix for suffixes in FORMATS.values() for suffix in suffixes)
 IMAGE_SUFFIXES = (*PICTURE_SUFFIXES, ".exr", *RAW_SUFFIXES)  # where several files fit, the first is preferred
 PHOTO_FOLDERS = ("images", "input")
+MASK_FOLDERS = (
+    "masks",
+    "mask",
+    "alpha",
+    "images_mask",
+    "images_masks",
+)  # `masks` is ours, the others are other programs'
 _RANKS = {suffix: rank for rank, suffix in enumerate(IMAGE_SUFFIXES)}
 # Words by which other programs tell a mask from its photo, as in 0001_mask.png, mask_0001.png and 0001.jpg.mask.png.
 _MASK_WORDS = re.compile(r"(?:mask|alpha|matte)[-_. ](?P<after>.+)|(?P<before>.+)[-_. ](?:mask|alpha|matte)", re.I)
@@ -85,10 +92,13 @@ class Files:
         """Return a folder inside the capture's by its path, whatever its letter case. Return None if there is none."""
         if parts not in self._folders:
             above = self.find_folder(*parts[:-1])
-            names = [] if above is None else self._list(above).folders.get(fold(parts[-1]), [])
-            name = parts[-1] if parts[-1] in names else min(names, default=None)
-            self._folders[parts] = None if above is None or name is None else above / name
+            self._folders[parts] = None if above is None else self.folder_in(above, parts[-1])
         return self._folders[parts]
+
+    def folder_in(self, above: Path, name: str) -> Path | None:
+        """Return the folder of that name in another folder, whatever its letter case. Return None if there is none."""
+        names = self._list(above).folders.get(fold(name), [])
+        return above / (name if name in names else min(names)) if names else None
 
     def images(self, folder: Path) -> list[str]:
         """List the names of the images in a folder, sorted. Hidden files are left out."""
@@ -206,7 +216,8 @@ def photos_in(files: Files, folder: Path, deep: bool) -> list[Path]:
         for name in names
         if name not in masks and (name.lower().endswith(PICTURE_SUFFIXES) or without_suffix(name) not in pictures)
     ]
-    return found + [photo for inner in files.folders(folder) if deep for photo in photos_in(files, inner, deep)]
+    inner = [path for path in files.folders(folder) if deep and fold(path.name) not in MASK_FOLDERS]
+    return found + [photo for path in inner for photo in photos_in(files, path, deep)]
 
 
 def leave_out_missing(source: Path, found: list[tuple[T, str, Path | None]]) -> tuple[list[tuple[T, Path]], list[str]]:

@@ -3,26 +3,31 @@
 import os
 import re
 from collections import Counter
+from itertools import product
 from pathlib import Path
 
-from refgs.capture.files import Files, fold, without_mask_word, without_suffix
-
-FOLDERS = ("masks", "mask", "alpha", "images_mask", "images_masks")  # `masks` is ours, the others are other programs'
+from refgs.capture.files import MASK_FOLDERS, Files, fold, without_mask_word, without_suffix
 
 
 def find_masks(files: Files, photos: list[Path]) -> dict[Path, Path]:
     """Return the mask file of each photo that has one.
 
     The mask of NAME.jpg is NAME.png or NAME.jpg.png in the folder `masks`, or the same with another image suffix. It may also be named
-    NAME_mask.png, mask_NAME.png or NAME.jpg.mask.png, and lie in another of FOLDERS. If photos are in subfolders, their masks are in
-    subfolders of `masks` with the same names, or in `masks` itself if no two photos have the same name. If there is no such mask,
-    NAME_alpha.png, NAME_mask.png or the like beside the photo is used, as in the scene `ball` of Shiny Blender.
+    NAME_mask.png, mask_NAME.png or NAME.jpg.mask.png, and lie in another of MASK_FOLDERS. If photos are in subfolders, their masks are in
+    subfolders of `masks` with the same names, in `masks` itself if no two photos have the same name, or in a folder `masks` beside the
+    photos or their folder. If there is no such mask, NAME_alpha.png, NAME_mask.png or the like beside the photo is used, as in the scene
+    `ball` of Shiny Blender.
     """
     found: dict[Path, Path] = {}
     for folder in mask_folders(files, photos):
-        found |= _match(files, folder, [photo for photo in photos if photo not in found])
-    beside = {}
-    for folder in {photo.parent for photo in photos}:
+        found |= _match(files, folder, files.folder, [photo for photo in photos if photo not in found])
+    beside, together = {}, {}
+    for photo in photos:
+        together.setdefault(photo.parent, []).append(photo)
+    for folder, some in together.items():
+        for root, name in product((folder, folder.parent), MASK_FOLDERS):
+            if root != files.folder and (inner := files.folder_in(root, name)) is not None:
+                found |= _match(files, inner, root, [photo for photo in some if photo not in found])
         beside |= {(folder, of): folder / name for name, of in sorted(files.masks_beside(folder).items(), reverse=True)}
     named = set(photos)
     for photo in photos:
@@ -35,12 +40,12 @@ def find_masks(files: Files, photos: list[Path]) -> dict[Path, Path]:
 def mask_folders(files: Files, photos: list[Path]) -> list[Path]:
     """List the folders in which masks of photos are looked for. Masks of the photos in `images_4` are first looked for in `masks_4`."""
     reduced = [match[0] for photo in photos[:1] if (match := re.search(r"_\d+$", photo.parent.name))]
-    names = [f"{name}{end}" for end in (*reduced, "") for name in FOLDERS]
+    names = [f"{name}{end}" for end in (*reduced, "") for name in MASK_FOLDERS]
     return [folder for name in names if (folder := files.find_folder(name)) is not None]
 
 
-def _match(files: Files, folder: Path, photos: list[Path]) -> dict[Path, Path]:
-    """Return the mask of each photo that has one in a folder. The most exact name counts."""
+def _match(files: Files, folder: Path, root: Path, photos: list[Path]) -> dict[Path, Path]:
+    """Return the mask of each photo that has one in a folder. The most exact name counts. `root` holds the folder and the photos."""
     exact, worded, bare = (
         {},
         {},
@@ -54,7 +59,7 @@ def _match(files: Files, folder: Path, photos: list[Path]) -> dict[Path, Path]:
         worded[fold(f"{above}/{name}".lstrip("/"))] = mask
         bare[fold(f"{above}/{without_suffix(name)}".lstrip("/"))] = mask
     found = {}
-    inner = {photo: _inner(files.folder, photo) for photo in photos}
+    inner = {photo: _inner(root, photo) for photo in photos}
     for names in (exact, worded):
         for photo, paths in inner.items():
             keys = [key for path in paths for key in (fold(path), fold(without_suffix(path)))]

@@ -13,6 +13,7 @@ import os
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
+from refgs.capture.files import without_suffix
 from refgs.capture.transforms import read_views
 from refgs.capture.types import Split, View
 from refgs.formats.transforms import Frame, read_novel_transforms, read_transforms
@@ -51,5 +52,5 @@ def _read(file: Path, split: Split) -> tuple[list[View], list[str]]:
 
 def _masked(frame: Frame) -> Frame:
     """Add the path of the frame's mask."""
-    path = PurePosixPath(frame.path)
-    return frame.model_copy(update={"mask_path": f"{path.parent}_mask/{path.stem}.png"})
+    path = PurePosixPath(without_suffix(frame.path))
+    return frame.model_copy(update={"mask_path": f"{path.parent}_mask/{path.name}.png"})
