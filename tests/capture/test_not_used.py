@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from refgs.capture import read_capture
+from refgs.capture import find_layout, read_capture
 from refgs.capture.check import describe
 from refgs.capture.not_used import not_used
 from tests.makers.captures import (
@@ -137,6 +137,12 @@ def test_the_first_of_equal_models_is_used(tmp_path):
     assert len(read_capture(folder).views) == 16
     assert "sparse/0 is used" in read_capture(folder).warnings[0]
     assert "2 not used, first sparse/1 (16 photos)" in read_capture(folder).warnings[0]
+
+
+def test_a_capture_that_is_named_colmap_is_its_own(tmp_path):
+    colmap(tmp_path / "colmap")
+    (tmp_path / "cameras.txt").write_text("of something else")
+    assert find_layout(tmp_path) is None and find_layout(tmp_path / "colmap") == "colmap"
 
 
 def test_a_model_uses_the_undistorted_photos_beside_it(tmp_path):

@@ -33,14 +33,12 @@ from refgs.formats.colmap import (
 class Model(NamedTuple):
     """Hold where a COLMAP capture's files are: its sparse model `folder` and the folder of its `photos`.
 
-    `root` holds the folder of photos and the folder `masks`. `top` is the capture's folder.
-    `others` are the models that are passed over for this one.
+    `root` holds the folder `masks`, and mostly the folder of photos. `others` are the models that are passed over for this one.
     """
 
     folder: Path
     photos: Path
     root: Path
-    top: Path
     others: list[Path]
 
 
@@ -51,18 +49,18 @@ def find_model(folder: Path) -> Model | None:
     """
     reduced = re.fullmatch(r"images_\d+", folder.name) is not None
     top = folder.parent if reduced else folder
-    found = [path for pattern in _MODELS for path in _sorted(top, pattern) if _is_model(path)]
+    found = [path for pattern in _MODELS for path in _sorted(top, pattern) if _is_model(path, pattern)]
     if not found:
         return None
     found.sort(key=_registered if len(found) > 1 else lambda _: 0, reverse=True)
     model = found[0]
     if reduced:
-        return Model(model, folder, top, top, found[1:])
+        return Model(model, folder, top, found[1:])
     # COLMAP's image_undistorter writes photos of its own beside the model.
     for above in (model.parent, model.parent.parent):
         if above != top and above.is_relative_to(top) and (above / "images").is_dir():
-            return Model(model, above / "images", above, top, found[1:])
-    return Model(model, photo_folder(Files(top)), top, top, found[1:])
+            return Model(model, above / "images", top, found[1:])
+    return Model(model, photo_folder(Files(top)), top, found[1:])
 
 
 # Where COLMAP and the programs that call it put models.
@@ -74,12 +72,20 @@ _MODELS = (
 
 def _sorted(top: Path, pattern: str) -> list[Path]:
     """Return the folders that match a pattern, `sparse/2` before `sparse/10`."""
-    found = [path for path in top.glob(pattern) if not path.name.startswith(".")] if pattern != "." else [top]
+    if pattern == ".":
+        return [top]
+    if (
+        pattern.startswith("colmap") and (top / "colmap" / "images").is_dir()
+    ):  # a capture of its own, in a folder of captures
+        return []
+    found = (path for path in top.glob(pattern) if not path.name.startswith("."))
     return sorted(found, key=lambda path: (len(path.name), path.name))
 
 
-def _is_model(folder: Path) -> bool:
-    return any((folder / f"{name}.{end}").is_file() for name in ("cameras", "images") for end in ("bin", "txt"))
+def _is_model(folder: Path, pattern: str) -> bool:
+    """Tell whether a folder has a model, of which in `sparse` a file may be missing: that is an error then."""
+    there = [any((folder / f"{name}.{end}").is_file() for end in ("bin", "txt")) for name in ("cameras", "images")]
+    return any(there) if pattern.startswith("sparse") else all(there)
 
 
 def _registered(model: Path) -> int:
@@ -121,7 +127,7 @@ def _passed_over(model: Model, count: int) -> list[str]:
     """Say which models are not used. Return no line if there is one model only. `count` are the photos of the one that is used."""
     if not model.others:
         return []
-    ours, first = (path.relative_to(model.top).as_posix() for path in (model.folder, model.others[0]))
+    ours, first = (path.relative_to(model.root).as_posix() for path in (model.folder, model.others[0]))
     what = f"{len(model.others) + 1} COLMAP models: {ours} is used, as no other has more than its {count} photos"
     return [f"{what}; {len(model.others)} not used, first {first} ({_registered(model.others[0])} photos)"]
 

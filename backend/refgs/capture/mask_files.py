@@ -19,8 +19,6 @@ def find_masks(files: Files, photos: list[Path]) -> dict[Path, Path]:
     `ball` of Shiny Blender.
     """
     found: dict[Path, Path] = {}
-    for folder in mask_folders(files, photos):
-        found |= _match(files, folder, files.folder, [photo for photo in photos if photo not in found])
     beside, together = {}, {}
     for photo in photos:
         together.setdefault(photo.parent, []).append(photo)
@@ -29,6 +27,8 @@ def find_masks(files: Files, photos: list[Path]) -> dict[Path, Path]:
             if root != files.folder and (inner := files.folder_in(root, name)) is not None:
                 found |= _match(files, inner, root, [photo for photo in some if photo not in found])
         beside |= {(folder, of): folder / name for name, of in sorted(files.masks_beside(folder).items(), reverse=True)}
+    for folder in mask_folders(files, photos):
+        found |= _match(files, folder, files.folder, [photo for photo in photos if photo not in found])
     named = set(photos)
     for photo in photos:
         mask = beside.get((photo.parent, fold(without_suffix(photo.name))))
