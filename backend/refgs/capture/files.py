@@ -73,7 +73,7 @@ class Files:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self._listings: dict[Path, _Listing | None] = {}
+        self._listings: dict[Path, _Listing] = {}
         self._folders: dict[tuple[str, ...], Path | None] = {(): folder}
         self._owned: dict[Path, Path] = {}
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from refgs.capture.files import Files
+from refgs.capture.files import PHOTO_FOLDERS, Files
 from refgs.capture.transforms import read_views
 from refgs.capture.types import Split, View
 from refgs.errors import InputError
@@ -26,7 +26,7 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.nda
     files = Files(folder)
 
     def photo(name: str) -> Path | str:
-        return files.find(name, "images") or name
+        return files.find(name, *PHOTO_FOLDERS) or name
 
     train = None if found.train_filenames is None else {photo(name) for name in found.train_filenames}
     test = {photo(name) for name in found.test_filenames or found.val_filenames or ()}

@@ -44,7 +44,8 @@ def _without_camera(capture: Capture, files: Files) -> list[Path]:
     used = {view.image_path for view in capture.views}
     stems = {(photo.parent, fold(without_suffix(photo.name))) for photo in used}
     folders = {photo.parent for photo in used}
-    tops = {files.find_folder(name) for name in PHOTO_FOLDERS} & {above for photo in used for above in photo.parents}
+    above = {above for photo in used for above in photo.parents}
+    tops = {top for name in PHOTO_FOLDERS if (top := files.find_folder(name)) is not None and top in above}
     found = {photo for folder in folders | tops for photo in photos_in(files, folder, deep=folder in tops)}
 
     def beside_one(photo: Path) -> bool:

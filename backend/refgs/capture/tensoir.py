@@ -41,7 +41,7 @@ def is_tensoir(folder: Path) -> bool:
 def read_tensoir(folder: Path) -> tuple[list[View], list[str]]:
     """Read the training and test views of a TensoIR capture, in the capture's coordinates, and warnings. Raises InputError."""
     found = _folders(folder, "train") + _folders(folder, "test")
-    named = [((view, split), f"{view.name}/{PHOTOS[0]}", _photo(view)) for view, split in found]
+    named = [(pair, f"{pair[0].name}/{PHOTOS[0]}", _photo(pair[0])) for pair in found]
     photos, warnings = leave_out_missing(folder, named)
     if light_folder(folder) is None:
         what = "Environment_Maps is neither beside the scene's folder nor above it"

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from refgs.camera import Camera
-from refgs.capture.files import Files, leave_out_missing, photo_view, without_suffix
+from refgs.capture.files import PHOTO_FOLDERS, Files, leave_out_missing, photo_view, without_suffix
 from refgs.capture.images import read_header
 from refgs.capture.lens import Lens
 from refgs.capture.mask_files import find_masks
@@ -62,7 +62,7 @@ def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> tuple[list[View
     "test". Raises InputError.
     """
     files = Files(file.parent)
-    named = [((frame, split), frame.path, files.find(frame.path, "images")) for frame, split in frames]
+    named = [(pair, pair[0].path, files.find(pair[0].path, *PHOTO_FOLDERS)) for pair in frames]
     found, warnings = leave_out_missing(file, named)
     masks = find_masks(files, [image for (frame, _), image in found if not frame.mask_path])
     views = []
