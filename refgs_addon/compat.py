@@ -10,6 +10,9 @@ EEVEE_WINDOW_BY_LENGTH = bpy.app.version >= (5, 1, 0)
 # Image settings of a file format, in the order to set them; from 5.0 a format belongs to a medium.
 FORMAT = (["media_type"] if bpy.app.version >= (5, 0, 0) else []) + ["file_format", "color_mode", "color_depth"]
 
+# Options of a property whose path may be relative to the .blend (`//`). Blender 4.5 warns without.
+BLEND_RELATIVE = {"ANIMATABLE", "PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else {"ANIMATABLE"}
+
 
 def set_format(settings: bpy.types.ImageFormatSettings, kind: str, depth: str) -> None:
     """Set the file format of saved RGBA pictures. `kind` is "PNG" or "OPEN_EXR"; `depth` is the number of bits per channel."""

@@ -11,6 +11,7 @@ from bpy.props import (
     StringProperty,
 )
 
+from .compat import BLEND_RELATIVE
 from .scene.batch_table import forget_table
 from .scene.run_parts import ROOT
 
@@ -18,8 +19,8 @@ from .scene.run_parts import ROOT
 class KnownRun(bpy.types.PropertyGroup):
     """Store one entry in the scene's list of runs: the folder of a training's result, and the capture that was trained."""
 
-    folder: StringProperty(subtype="DIR_PATH")
-    capture: StringProperty(subtype="DIR_PATH")
+    folder: StringProperty(subtype="DIR_PATH", options=BLEND_RELATIVE)
+    capture: StringProperty(subtype="DIR_PATH", options=BLEND_RELATIVE)
     confirmed: StringProperty(description="Decisions of the training that the artist keeps, as need=answer")
 
 
@@ -37,11 +38,13 @@ class Many(bpy.types.PropertyGroup):
         name="Captures",
         description="Folder of captures: each folder in it has the photos of one",
         subtype="DIR_PATH",
+        options=BLEND_RELATIVE,
     )
     results: StringProperty(
         name="Results",
         description="Folder for the results, a run folder for each capture. If left empty, a folder beside the captures",
         subtype="DIR_PATH",
+        options=BLEND_RELATIVE,
     )
     preset: EnumProperty(name="Quality", items=PRESETS, default="quick")
 
@@ -62,11 +65,13 @@ class Training(bpy.types.PropertyGroup):
         name="Capture",
         description="Folder with the photos, and with their cameras if there are any: NeRF-Blender, nerfstudio or COLMAP",
         subtype="DIR_PATH",
+        options=BLEND_RELATIVE,
     )
     out: StringProperty(
         name="Run Folder",
         description="New or empty folder for the result. If left empty, a folder beside the capture",
         subtype="DIR_PATH",
+        options=BLEND_RELATIVE,
     )
     preset: EnumProperty(name="Quality", items=PRESETS, default="quick")
     limited: BoolProperty(

@@ -33,7 +33,7 @@ def read_cameras(path: Path, capture: Path | None) -> list[dict]:
                 or min(frame["w"], frame["h"]) < 1
             ):
                 raise ValueError
-            frame["name"] = Path(frame["file_path"]).stem
+            frame["name"] = str.rpartition(frame["file_path"], "/")[2]  # a dot is a part of it
             frame["photo"] = str(capture / frame["photo"]) if capture and "photo" in frame else ""
     except (ValueError, KeyError, TypeError, OverflowError):
         raise InputError(f"{path} is not the cameras.json of a RefGS run: export the run again") from None
@@ -47,7 +47,7 @@ def light_of(path: Path) -> str:
     """
     found = read_json(path)
     name = found.get("light_of", "") if isinstance(found, dict) else ""
-    return Path(name).stem if isinstance(name, str) else ""
+    return name.rpartition("/")[2] if isinstance(name, str) else ""
 
 
 def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Object:

@@ -145,12 +145,16 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
     Vertices that the file doubles at the seams of the textures are merged, so that the mesh is closed.
     """
     _check_self_contained(path)
-    before = set(bpy.data.objects)
+    before, units = set(bpy.data.objects), bpy.context.scene.unit_settings
+    # The importer takes the file's units for metres; the splats' are Blender's.
+    length, units.scale_length = units.scale_length, 1.0
     try:
         bpy.ops.import_scene.gltf(filepath=str(path), merge_vertices=True)
     except (AttributeError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"Blender's glTF add-on did not import {path}: {reason}") from None
+    finally:
+        units.scale_length = length
     added = [item for item in bpy.data.objects if item not in before]
     bpy.context.view_layer.update()
     meshes = [item for item in added if item.type == "MESH"]

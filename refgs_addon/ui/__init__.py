@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import job_timers, preferences, properties
+from .. import blend_paths, job_timers, preferences, properties
 from . import (
     checked_capture,
     closing,
@@ -25,6 +25,7 @@ from . import (
 _MODULES = (
     preferences,
     properties,
+    blend_paths,
     operators,
     trainer_buttons,
     icons,

@@ -46,6 +46,18 @@ def test_a_light_that_turned_is_said_to(run_folder, scene):
     assert "shifted" in run.cameras
 
 
+def test_photos_with_dots_in_their_names(run_folder, scene):
+    names = ["render.0001", "render.0002"]
+    file = run_folder / "cameras.json"
+    data = json.loads(file.read_text())
+    for name, frame in zip(names, data["frames"], strict=True):
+        frame["file_path"] = f"images/{name}"
+    file.write_text(json.dumps(data | {"light_of": "images/render.0002"}))
+    run = import_run(run_folder, scene)
+    assert list(run.cameras) == [camera.name for camera in run.cameras.values()] == names
+    assert run.light_of == "render.0002"
+
+
 @pytest.mark.parametrize(
     ("made_by", "is_newer"), [('"0.2.9"', False), ('"0.10.0"', True), ('"99.0"', True), ("5", False), ('"x"', False)]
 )
@@ -253,6 +265,20 @@ def test_mesh_stands_where_the_splats_are(run):
     np.testing.assert_allclose(corners.min(axis=0), [0.9, -3.3, 1.8], atol=1e-5)
     np.testing.assert_allclose(corners.max(axis=0), [1.1, -2.7, 2.2], atol=1e-5)
     assert mesh.users_collection == (run.collection,) and mesh.parent == run.root
+
+
+@pytest.mark.parametrize("unit", [0.001, 0.01, 1.0, 25.0])
+def test_all_parts_are_of_one_size_in_a_scene_of_any_unit(run_folder, scene, unit):
+    usual = import_run(run_folder, scene)
+    scene.unit_settings.scale_length = unit
+    run = import_run(run_folder, scene)
+    scene.view_layers[0].update()
+    assert scene.unit_settings.scale_length == pytest.approx(unit)
+    (mesh,), (other,) = run.mesh, usual.mesh
+    assert np.allclose(mesh.matrix_world, other.matrix_world) and np.allclose(mesh.bound_box, other.bound_box)
+    assert mesh.dimensions == other.dimensions and run.splats.dimensions == usual.splats.dimensions
+    for camera, before in zip(run.cameras.values(), usual.cameras.values(), strict=True):
+        assert np.allclose(camera.matrix_world, before.matrix_world)
 
 
 def test_one_empty_moves_the_whole_run(run, scene):

@@ -97,6 +97,21 @@ def test_cameras_in_a_room_are_not_taken_for_opencvs(tmp_path):
     assert "the cameras look outwards" in said and "OpenCV" not in said and "see the centre" not in said
 
 
+def test_masks_that_look_inverted(tmp_path):
+    folder = nerfstudio(tmp_path, count=24)
+    for i, pose in enumerate(ring(24)):
+        mask = ball(pose, 64, 48, 60.0)[..., 3]
+        write(folder / "masks" / f"{i:04d}.png", 255 - mask if i in (5, 9) else mask)
+    said = text(folder)
+    assert (
+        "Warning: 2 of 24 masks look inverted, white in the corners and black in the middle, first masks/0005.png: inv"
+        in said
+    )
+    for i in (5, 9):
+        write(folder / "masks" / f"{i:04d}.png", np.full((48, 64), 255, np.uint8))  # the object fills the photo
+    assert "inverted" not in text(folder)
+
+
 def test_blurred_photos_are_named(tmp_path):
     folder = nerfstudio(tmp_path, count=24)
     rng = np.random.default_rng(0)

@@ -16,7 +16,7 @@ from refgs.camera import Camera
 from refgs.capture import View, load_view, read_capture
 from refgs.capture.check import check
 from refgs.capture.files import find_photos
-from refgs.capture.images import read_focal_length, read_header, read_image, write_for_colmap
+from refgs.capture.images import read_focal_length, read_header, read_image, read_mask, write_for_colmap
 from refgs.color import srgb_decode
 from refgs.errors import InputError
 from refgs.formats.exr import write_exr
@@ -24,6 +24,80 @@ from tests.makers.captures import colmap, edit, nerf_blender, nerfstudio, write,
 from tests.makers.dng import write_dng
 
 OPENCV = (4, "OPENCV", [60.0, 61.0, 31.0, 25.0, -0.2, 0.05, 0.003, -0.002])
+
+
+INSIDE = np.hypot(*np.mgrid[-10:10, -15:15]) < 7
+
+
+def _palette(path, colors: list[tuple[int, int, int]], labels: np.ndarray) -> None:
+    picture = Image.fromarray(labels.astype(np.uint8), "P")
+    picture.putpalette([value for color in colors for value in color])
+    picture.save(path)
+
+
+def _davis(path) -> None:
+    _palette(path, [(0, 0, 0), (128, 0, 0), (0, 128, 0)], INSIDE)
+
+
+def _two_objects(path) -> None:
+    _palette(path, [(0, 0, 0), (128, 0, 0), (0, 128, 0), (64, 0, 0)], INSIDE * np.where(np.arange(30) < 15, 1, 3))
+
+
+def _bright_background(path) -> None:
+    _palette(path, [(230, 25, 75), (60, 180, 75)], INSIDE)
+
+
+def _labels_all_black(path) -> None:
+    _palette(path, [(0, 0, 0)] * 4, 2 * INSIDE)
+
+
+def _grey_palette(path) -> None:
+    _palette(path, [(255, 255, 255), (0, 0, 0)], ~INSIDE)
+
+
+@pytest.mark.parametrize(
+    ("name", "save"),
+    [
+        *(
+            (f"{low}-{high}.png", np.where(INSIDE, high, low).astype(np.uint8))
+            for low, high in ((0, 1), (0, 2), (0, 100), (0, 255))
+        ),
+        *(
+            (f"{low}-{high}.png", np.where(INSIDE, high, low).astype(np.uint8))
+            for low, high in ((1, 2), (10, 90), (128, 255))
+        ),
+        *((f"16-{high}.png", np.where(INSIDE, high, 0).astype(np.uint16)) for high in (1, 100, 255, 256, 65535)),
+        ("16.tiff", np.where(INSIDE, 7, 3).astype(np.uint16)),
+        ("32.tiff", np.where(INSIDE, 2, 1).astype(np.int32)),
+        ("float.tiff", np.where(INSIDE, 1, 0).astype(np.float32)),
+        ("bits.png", INSIDE),
+        ("color.png", np.where(INSIDE[..., None], (0, 128, 0), 0).astype(np.uint8)),
+        ("alpha.png", np.dstack([np.zeros((20, 30, 3)), np.where(INSIDE, 100, 0)]).astype(np.uint8)),
+        ("davis.png", _davis),
+        ("two-objects.png", _two_objects),
+        ("bright.png", _bright_background),
+        ("black.gif", _labels_all_black),
+        ("grey.png", _grey_palette),
+    ],
+)
+def test_two_values_of_any_kind_are_a_mask(tmp_path, name, save):
+    path = tmp_path / name
+    save(path) if callable(save) else Image.fromarray(save).save(path)
+    assert np.array_equal(read_mask(path), np.where(INSIDE, 255, 0))
+
+
+def test_a_soft_mask_keeps_its_edge(tmp_path):
+    values = np.tile(np.linspace(0, 250, 30).astype(np.uint8), (20, 1))
+    Image.fromarray(values).save(tmp_path / "a.png")
+    Image.fromarray(values.astype(np.uint16) * 257).save(tmp_path / "b.png")
+    for name in ("a.png", "b.png"):
+        assert np.array_equal(read_mask(tmp_path / name), values)
+
+
+@pytest.mark.parametrize(("value", "read"), [(0, 0), (1, 255), (128, 255), (255, 255)])
+def test_masks_of_one_value(tmp_path, value, read):
+    Image.fromarray(np.full((20, 30), value, np.uint8)).save(tmp_path / "a.png")
+    assert (read_mask(tmp_path / "a.png") == read).all()
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])

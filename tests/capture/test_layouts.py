@@ -207,13 +207,42 @@ def test_photos_both_trained_and_tested_on_are_warned_of(tmp_path):
     assert warning.startswith("12 photos are both trained and tested on, first r_0.png: ")
 
 
-def test_instant_ngp_deleted_photos_are_left_out(tmp_path):
-    folder = nerfstudio(tmp_path)
-    (folder / "images" / "0003.png").unlink()
-    edit(folder / "transforms.json", lambda data: data.update(aabb_scale=4))
+@pytest.mark.parametrize("make", MAKERS)
+def test_a_removed_photo_leaves_its_camera_out(tmp_path, make):
+    folder = MAKERS[make](tmp_path / "capture")
+    before = read_capture(folder)
+    gone = before.train_views[2].image_path
+    gone.unlink()
     capture = read_capture(folder)
-    assert len(capture.views) == 15
-    assert "1 of the 16 images" in capture.warnings[0] and "0003.png" in capture.warnings[0]
+    assert [v.image_path for v in capture.views if v.split == "train"] == [
+        v.image_path for v in before.train_views if v.image_path != gone
+    ] or make in ("nerfstudio", "colmap", "colmap-text", "nero")  # which hold out other photos then
+    assert {v.image_path for v in capture.views} == {v.image_path for v in before.views} - {gone}
+    (said,) = set(capture.warnings) - set(before.warnings)
+    name = gone.parent.name if make == "tensoir" else gone.stem
+    assert said.startswith("1 of the 1") and "are missing and left out, first " in said and name in said
+    assert_sees_the_ball(capture)
+
+
+@pytest.mark.parametrize("keep", ["none", "empty", "some", "numbers"])
+def test_colmap_text_without_keypoints(tmp_path, keep):
+    """Check images.txt without the lines of keypoints, with empty ones, and with photos whose names look like keypoints."""
+    folder = colmap(tmp_path, binary=False)
+    file = folder / "sparse" / "0" / "images.txt"
+    lines = [line for line in file.read_text().splitlines() if line.endswith(".png")]
+    between = {"none": [], "empty": [""], "some": ["1 2 -1 3 4 5"], "numbers": ["1 2 -1"]}[keep]
+    if keep == "some":
+        lines[3] += "\n1.5 2.5 77"
+    if keep == "numbers":
+        for i in range(16):
+            lines[i] = lines[i].replace(".png", "" if i % 2 else " 7 8.png")
+            (folder / "images" / f"{i:04d}.png").rename(
+                folder / "images" / (f"{i:04d}.png" if i % 2 else f"{i:04d} 7 8.png")
+            )
+    file.write_text("\n".join(line for image in lines for line in [image, *between]) + "\n")
+    capture = read_capture(folder)
+    assert len(capture.views) == 16
+    assert_sees_the_ball(capture)
 
 
 def test_nerfstudio_points(tmp_path):

@@ -229,6 +229,25 @@ def test_photos_with_opaque_alpha_get_masks(tmp_path):
     assert read_capture(tmp_path).masked
 
 
+def test_photos_of_one_name_in_two_folders_get_masks_of_their_own(tmp_path):
+    folder = nerfstudio(tmp_path)
+
+    def move(data):
+        for i, frame in enumerate(data["frames"]):
+            path = f"cam{1 + i % 2}/{i // 2:04d}.png"
+            (folder / path).parent.mkdir(exist_ok=True)
+            (folder / frame["file_path"]).rename(folder / path)
+            frame["file_path"] = path
+
+    edit(folder / "transforms.json", move)
+    views = read_capture(folder).views
+    targets = making._targets(folder, views)
+    assert [targets[view] for view in views] == [folder / "masks" / v.image_path.relative_to(folder) for v in views]
+    for i, target in enumerate(targets.values()):
+        write(target, np.tri(48, 64, i, dtype=np.uint8) * 255)
+    assert [view.mask_path for view in read_capture(folder).views] == list(targets.values())
+
+
 def test_masks_are_not_made_where_they_would_not_be_read(tmp_path):
     folder = nero(tmp_path / "bell")
     for depth in folder.glob("*-depth.png"):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from refgs.capture import load_view, read_capture
 from refgs.capture.colmap_steps import MATCH_TOLERANCE, _write_mask, epipolar_distance
@@ -69,6 +70,26 @@ def test_photos_become_a_capture(photos):
     assert distances.max() < 0.02 and angles.max() < 1
     with pytest.raises(InputError, match="cameras already"):
         find_cameras(photos, quiet)
+
+
+def test_photos_of_two_cameras_in_subfolders(tmp_path, pictures):
+    """Check photos that have the same names in two folders, in formats that COLMAP does not read."""
+    for number, picture in enumerate(pictures):
+        file = tmp_path / "images" / f"cam{1 + number % 2}" / f"{number // 2}.{'jfif' if number % 2 else 'avif'}"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(picture).save(file, "JPEG" if number % 2 else "AVIF", quality=95)
+        write(
+            tmp_path / "masks" / file.parent.name / f"{number // 2}.png",
+            np.full((HEIGHT, WIDTH), 255 * (number > 0), np.uint8),
+        )
+    assert find_cameras(tmp_path, quiet)["placed"] == 10
+    capture = read_capture(tmp_path)
+    views = sorted(capture.views, key=lambda view: view.camera.name)
+    taken = [(view.image_path.parent.name, view.image_path.stem) for view in views]
+    assert sorted(taken) == [(camera, str(i)) for camera in ("cam1", "cam2") for i in range(5)]
+    assert [view.mask_path for view in views] == [tmp_path / "masks" / camera / f"{name}.png" for camera, name in taken]
+    distances, angles = pose_errors(views, [POSES[2 * int(name) + int(camera[3:]) - 1] for camera, name in taken])
+    assert distances.max() < 0.02 and angles.max() < 1
 
 
 def test_one_that_is_interrupted_goes_on(photos):

@@ -60,6 +60,17 @@ def test_files_have_their_photos_names_and_words_that_programs_append(tmp_path):
     assert chosen(tmp_path) == {f"000{i}": name.split("/")[-1] for i, name in enumerate(names, start=1)}
 
 
+def test_other_spellings_of_names(tmp_path):
+    folder = nerfstudio(tmp_path)
+    (folder / "images" / "0003.png").rename(folder / "images" / "Ü_3.png")
+    edit(folder / "transforms.json", lambda data: data["frames"][3].update(file_path="images/Ü_3.png"))
+    touch(folder, "Normals/U\u0308_3_pred.npy", "Normals/._0002.npy")
+    views = read_capture(folder).views
+    assert {v.image_path.name: v.prior_normals for v in views if v.prior_normals} == {
+        "Ü_3.png": folder / "Normals" / "U\u0308_3_pred.npy"
+    }
+
+
 def test_exact_files_are_taken_before_pictures_of_them(tmp_path):
     nerfstudio(tmp_path)
     touch(tmp_path / "normals", "0001.jpg", "0001.npz", "0002_normals.png", "0002.png")

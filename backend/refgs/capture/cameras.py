@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from refgs.camera import Camera
-from refgs.capture.files import find_image
+from refgs.capture.files import PHOTO_FOLDERS, Files
 from refgs.capture.images import read_header
 from refgs.capture.poses import OPENGL_TO_OPENCV, in_frame
 from refgs.capture.transforms import frame_camera, where
@@ -27,9 +27,9 @@ def read_cameras(file: Path) -> list[Camera]:
     found = read_transforms(file)
     if not found.frames:
         raise InputError(f"{file}: there are no frames in it. Export the cameras again.")
-    cameras = []
+    files, cameras = Files(file.parent), []
     for frame in found.frames:
-        image = find_image(file.parent / frame.path) if None in (frame.w, frame.h) else None
+        image = files.find(frame.path, *PHOTO_FOLDERS) if None in (frame.w, frame.h) else None
         camera, lens = frame_camera(frame, where(file, frame), read_header(image)[:2] if image else None)
         cameras.append(lens.pinhole(camera, where(file, frame)) if lens else camera)
     if found.to_capture is not None:

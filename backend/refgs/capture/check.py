@@ -1,6 +1,7 @@
 """Check a capture: decode all photos and masks, list its contents, and warn of likely mistakes."""
 
 import math
+import os
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,11 @@ from PIL import Image
 
 from refgs.capture.cameras import write_cameras
 from refgs.capture.images import LoadedView, load_view
+from refgs.capture.not_used import not_used
 from refgs.capture.priors import FOLDERS, load_depth, load_normals
 from refgs.capture.region import LOOK_OUT
 from refgs.capture.types import Z_UP, Capture, View
-from refgs.errors import InputError
+from refgs.errors import InputError, one_line
 from refgs.paths import whole
 
 THUMBNAILS, THUMBNAIL_SIDE = 12, 128  # maximum number; pixels
@@ -52,7 +54,7 @@ def check(capture: Capture, out: Path) -> dict[str, Any]:
 
 
 def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
-    """Describe a capture in lines of text. At the end there is a line `Warning: …` for each likely mistake.
+    """Describe a capture in lines of text. At the end there are lines `Not used: …` and `Warning: …` for likely mistakes.
 
     Decodes every photo, mask and prior. Raises InputError if some of these files cannot be read: the message says how many, and names the
     first. If the folder `thumbnails` is given, thumbnails of up to 12 photos are written to it.
@@ -69,7 +71,8 @@ def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
         _poses(capture),
         _extent(capture),
         f"Taken for {'an object' if capture.bounded else 'a room or open scene'}: {capture.bounded_because}",
-        *(f"Warning: {warning}" for warning in [*capture.warnings, *_warnings(capture, statistics)]),
+        *(f"Not used: {one_line(what)}" for what in not_used(capture)),
+        *(f"Warning: {one_line(warning)}" for warning in [*capture.warnings, *_warnings(capture, statistics)]),
     ]
 
 
@@ -78,7 +81,7 @@ class _Statistics:
 
     `coverage` is the fraction of pixels inside the mask, None without a mask. `clipped` is the fraction of clipped pixels. `brightness` is
     the mean of the 8-bit values, and `brightest` their 99th percentile. `grey` is True if the photo has no colour. `sharpness` comes from
-    `_sharpness`.
+    `_sharpness`. `inverted` is True if the mask is white in the corners, but black on a quarter or more of the middle.
     """
 
     def __init__(self, loaded: LoadedView):
@@ -86,10 +89,19 @@ class _Statistics:
         shown = loaded.bytes
         pixels = shown[inside] if inside.any() else np.zeros((1, 3), np.uint8)
         self.coverage = None if loaded.alpha is None else float(inside.mean())
+        self.inverted = loaded.alpha is not None and _is_inverted(inside)
         self.clipped = float(np.any(loaded.clipped, axis=2)[inside].mean()) if inside.any() else 0.0
         self.brightness, self.brightest = float(pixels.mean()), float(np.percentile(pixels, 99))
         self.grey = bool((pixels.max(axis=1) == pixels.min(axis=1)).all())
         self.sharpness = _sharpness(shown, inside)
+
+
+def _is_inverted(inside: np.ndarray) -> bool:
+    height, width = inside.shape
+    top, left = height // 50, width // 50  # not the very corners, which show nothing if distortion was removed
+    corners = inside[np.ix_([top, height - 1 - top], [left, width - 1 - left])]
+    middle = inside[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    return bool(corners.all() and middle.mean() <= 0.75)
 
 
 def _sharpness(image: np.ndarray, inside: np.ndarray) -> float:
@@ -228,6 +240,12 @@ def _warnings(capture: Capture, statistics: list[_Statistics]) -> list[str]:
         count("have no mask", unmasked, "make them masks, or remove the photos")
     empty = [view for view, s in pairs if s.coverage == 0]
     count("have an empty mask", empty, "make the masks anew, or remove the photos")
+    if inverted := [view.mask_path or view.image_path for view, s in pairs if s.inverted]:
+        first = Path(os.path.relpath(inverted[0], capture.folder)).as_posix()
+        what = (
+            f"{len(inverted)} of {len(capture.views)} masks look inverted, white in the corners and black in the middle"
+        )
+        warnings.append(f"{what}, first {first}: invert them, so that the object is white and the rest black")
     grey = [view for view, s in pairs if s.grey and s.coverage != 0]
     count("are greyscale", grey, "put the photos in colour in their place")
     clipped = [view for view, s in pairs if s.clipped > 0.1]

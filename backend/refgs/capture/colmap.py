@@ -1,4 +1,4 @@
-"""Read COLMAP captures: a sparse model in `sparse/0` or `sparse`, binary or text, with photos in `images` or in the capture's folder.
+"""Read COLMAP captures: a sparse model in one of _MODELS, binary or text, with photos in `images`, `input` or the capture's folder.
 
 Some data sets, such as the real scenes of Ref-NeRF and mip-NeRF 360, also have reduced photos in `images_2`, `images_4` and `images_8`. To
 use them, pass the path of such a folder as the capture's. Reduced photos may have another file suffix than the photos that the model names.
@@ -6,12 +6,14 @@ use them, pass the path of such a folder as the capture's. Reduced photos may ha
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from refgs.camera import Camera
-from refgs.capture.files import Masks, all_found, find_image, photo_view
+from refgs.capture.files import PHOTO_FOLDERS, Files, fold, leave_out_missing, photo_folder, photo_view
 from refgs.capture.lens import BROWN, Lens, check_intrinsics
+from refgs.capture.mask_files import find_masks
 from refgs.capture.poses import world_to_camera
 from refgs.capture.transforms import camera_name
 from refgs.capture.types import View
@@ -21,6 +23,7 @@ from refgs.formats.colmap import (
     UNDISTORT,
     Image,
     Intrinsics,
+    count_images,
     model_files,
     read_cameras,
     read_images,
@@ -28,28 +31,78 @@ from refgs.formats.colmap import (
 )
 
 
-def find_model(folder: Path) -> tuple[Path, Path] | None:
-    """Return two folders of a capture: that of its photos and that of its sparse model. Return None if there is no model.
+class Model(NamedTuple):
+    """Hold where a COLMAP capture's files are: its sparse model `folder` and the folder of its `photos`.
+
+    `root` holds the folder `masks`, and mostly the folder of photos. `others` are the models that are passed over for this one.
+    """
+
+    folder: Path
+    photos: Path
+    root: Path
+    others: list[Path]
+
+
+def find_model(folder: Path) -> Model | None:
+    """Return the COLMAP model of a capture that has the most photos, or None if there is none. Of equal ones, the first in _MODELS counts.
 
     `folder` is the capture's folder, or its subfolder `images_N` with reduced photos.
     """
-    reduced = re.fullmatch(r"images_\d+", folder.name)
-    root, photos = (folder.parent, folder) if reduced else (folder, folder / "images")
-    if not photos.is_dir():
-        photos = folder
-    candidates = (root / "sparse" / "0", root / "sparse")
-    names = ("cameras.bin", "cameras.txt", "images.bin", "images.txt")
-    model = next((path for path in candidates if any((path / name).is_file() for name in names)), None)
-    return None if model is None else (photos, model)
+    reduced = re.fullmatch(r"images_\d+", folder.name) is not None
+    top = folder.parent if reduced else folder
+    found = [path for pattern in _MODELS for path in _sorted(top, pattern) if _is_model(path, pattern)]
+    if not found:
+        return None
+    found.sort(key=_registered if len(found) > 1 else lambda _: 0, reverse=True)
+    model = found[0]
+    if reduced:
+        return Model(model, folder, top, found[1:])
+    # COLMAP's image_undistorter writes photos of its own beside the model.
+    for above in (model.parent, model.parent.parent):
+        if above != top and above.is_relative_to(top) and (above / "images").is_dir():
+            return Model(model, above / "images", top, found[1:])
+    return Model(model, photo_folder(Files(top)), top, found[1:])
 
 
-def read_colmap(photos: Path, model: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None]:
-    """Read a COLMAP model. Return its views (photos with cameras), its points (M, 3), and their colours (M, 3) in 0..1.
+# Where COLMAP and the programs that call it put models.
+_MODELS = (
+    *("sparse/*", "sparse", "colmap/sparse/*", "colmap/sparse", "colmap"),
+    *("dense/sparse/*", "dense/sparse", "dense/*/sparse", "distorted/sparse/*", "."),
+)
 
-    Everything is in the model's coordinates. `photos` and `model` are the folders that `find_model` returns. Points and colours are None if
-    the model has no file of points. Raises InputError.
+
+def _sorted(top: Path, pattern: str) -> list[Path]:
+    """Return the folders that match a pattern, `sparse/2` before `sparse/10`."""
+    if pattern == ".":
+        return [top]
+    if (
+        pattern.startswith("colmap") and (top / "colmap" / "images").is_dir()
+    ):  # a capture of its own, in a folder of captures
+        return []
+    found = (path for path in top.glob(pattern) if not path.name.startswith("."))
+    return sorted(found, key=lambda path: (len(path.name), path.name))
+
+
+def _is_model(folder: Path, pattern: str) -> bool:
+    """Tell whether a folder has a model, of which in `sparse` a file may be missing: that is an error then."""
+    there = [any((folder / f"{name}.{end}").is_file() for end in ("bin", "txt")) for name in ("cameras", "images")]
+    return any(there) if pattern.startswith("sparse") else all(there)
+
+
+def _registered(model: Path) -> int:
+    """Count the photos of a model. A file that cannot be read has none: it is read only if there is no other."""
+    try:
+        return count_images(model_files(model)[1])
+    except InputError:
+        return 0
+
+
+def read_colmap(model: Model) -> tuple[list[View], np.ndarray | None, np.ndarray | None, list[str]]:
+    """Read a COLMAP model. Return its views (photos with cameras), its points (M, 3), their colours (M, 3) in 0..1, and warnings.
+
+    Everything is in the model's coordinates. Points and colours are None if the model has no file of points. Raises InputError.
     """
-    cameras_file, images_file, points_file = model_files(model)
+    cameras_file, images_file, points_file = model_files(model.folder)
     for file in (cameras_file, images_file):
         if not file.is_file():
             raise InputError(f"{file}: the file is missing. Export the sparse model again.")
@@ -57,27 +110,39 @@ def read_colmap(photos: Path, model: Path) -> tuple[list[View], np.ndarray | Non
     images = sorted(read_images(images_file), key=lambda image: image.name)
     points, colors = read_points(points_file) if points_file.is_file() else (None, None)
 
-    found = [(f"{photos.name}/{image.name}", find_image(photos / image.name, any_suffix=True)) for image in images]
-    masks = Masks(masks_root(photos))
+    photos, files = Files(model.photos), Files(model.root)
+    named = [(image, f"{model.photos.name}/{image.name}", _find(photos, image.name)) for image in images]
+    found, warnings = leave_out_missing(images_file, named)
+    masks = find_masks(files, [photo for _, photo in found])
     views = []
-    for image, path in zip(images, all_found(images_file, found), strict=True):
+    for image, path in found:
         where = f"{images_file}, image {image.name}"
         if image.camera_id not in cameras:
             raise InputError(f"{where}: its camera {image.camera_id} is not in {cameras_file.name}. Export it again.")
-        mask = masks.find(path, None, where)
-        views.append(photo_view(path, _camera(image, cameras[image.camera_id], where), "train", mask, where))
-    return views, points, colors
+        camera = _camera(image, cameras[image.camera_id], where)
+        views.append(photo_view(path, camera, "train", masks.get(path), where))
+    return views, points, colors, [*_passed_over(model, len(images)), *warnings]
 
 
-def masks_root(photos: Path) -> Path:
-    """Return the folder in which the folder `masks` lies: the one that also has `sparse`. `photos` is the folder of the photos."""
-    return photos if (photos / "sparse").is_dir() else photos.parent
+def _passed_over(model: Model, count: int) -> list[str]:
+    """Say which models are not used. Return no line if there is one model only. `count` are the photos of the one that is used."""
+    if not model.others:
+        return []
+    ours, first = (path.relative_to(model.root).as_posix() for path in (model.folder, model.others[0]))
+    what = f"{len(model.others) + 1} COLMAP models: {ours} is used, as no other has more than its {count} photos"
+    return [f"{what}; {len(model.others)} not used, first {first} ({_registered(model.others[0])} photos)"]
+
+
+def _find(photos: Files, name: str) -> Path | None:
+    """Find a photo by its name in a model. COLMAP may have been run on the folder above that of the photos, such as `images`."""
+    first, _, rest = name.replace("\\", "/").partition("/")
+    return photos.find(name) or (photos.find(rest) if fold(first) in PHOTO_FOLDERS else None)
 
 
 def capture_root(folder: Path, layout: str) -> Path:
     """Return the folder in which the folder `masks` of a capture lies. `folder` and `layout` are the capture's."""
     model = find_model(folder) if layout == "colmap" else None
-    return folder if model is None else masks_root(model[0])
+    return folder if model is None else model.root
 
 
 def _camera(image: Image, intrinsics: Intrinsics, where: str) -> tuple[Camera, Lens | None]:

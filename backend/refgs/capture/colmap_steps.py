@@ -3,6 +3,7 @@
 `motion.find_cameras` decides which steps to take, and judges the cameras found.
 """
 
+import os
 import shutil
 from collections import Counter
 from collections.abc import Callable
@@ -78,12 +79,13 @@ def extract_features(photos: list[Path], masks: list[Path], database: Path, prog
         cameras = {_lens(camera): camera.camera_id for camera in known.read_all_cameras()}
     readable = database.with_name(f"{database.name}.photos")
     readable.mkdir(exist_ok=True)
+    top = Path(os.path.commonpath([photo.parent for photo in photos]))
     numbers: dict[str, str] = {}
     for start in range(0, len(photos), 2 * CORES):
         progress("features", start, len(photos))
         shared: dict[tuple[int, Path], list[str]] = {}
         for number, photo in list(enumerate(photos))[start : start + 2 * CORES]:
-            folder, name = photo.parent, photo.name
+            folder, name = top, photo.relative_to(top).as_posix()
             if write_for_colmap(photo, readable / f"{number}.jpg"):
                 # In a folder of its own, because a photo may be named 0.jpg.
                 folder, name = database.parent, f"{readable.name}/{number}.jpg"

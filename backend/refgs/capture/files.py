@@ -1,103 +1,242 @@
-"""Find the photos and masks of a capture on disk, and combine each photo with its camera in a View."""
+"""Find the photos of a capture on disk by the names that its files give them, and combine each photo with its camera in a View."""
 
 import os
+import posixpath
+import re
+import unicodedata
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 from refgs.camera import Camera
-from refgs.capture.images import read_header
+from refgs.capture.images import FORMATS, read_header
 from refgs.capture.lens import Lens
 from refgs.capture.raw import SUFFIXES as RAW_SUFFIXES
 from refgs.capture.types import Split, View
-from refgs.errors import InputError
+from refgs.errors import InputError, one_line
 
-PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".heic", ".heif", ".hif", ".tif", ".tiff", ".webp", ".bmp")
-IMAGE_SUFFIXES = (*PICTURE_SUFFIXES, ".exr", *RAW_SUFFIXES)
+T = TypeVar("T")
 
-
-def find_image(path: Path, any_suffix: bool = False) -> Path | None:
-    """Return the image file at `path`. If it is absent, try `path` with an image suffix added. Return None if no file is found.
-
-    With `any_suffix`, an image suffix of `path` may also be replaced by another one.
-    """
-    # Not Path.is_file, which raises OSError for a name that is too long.
-    if os.path.isfile(path):
-        return path
-    if not path.name:  # the root
-        return None
-    if any_suffix and path.suffix.lower() in IMAGE_SUFFIXES:
-        path = path.with_suffix("")
-    names = (path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES + tuple(map(str.upper, IMAGE_SUFFIXES)))
-    return next((name for name in names if os.path.isfile(name)), None)
+PICTURE_SUFFIXES = tuple(suffix for suffixes in FORMATS.values() for suffix in suffixes)
+IMAGE_SUFFIXES = (*PICTURE_SUFFIXES, ".exr", *RAW_SUFFIXES)  # where several files fit, the first is preferred
+PHOTO_FOLDERS = ("images", "input")
+MASK_FOLDERS = (
+    "masks",
+    "mask",
+    "alpha",
+    "images_mask",
+    "images_masks",
+)  # `masks` is ours, the others are other programs'
+_RANKS = {suffix: rank for rank, suffix in enumerate(IMAGE_SUFFIXES)}
+# Words by which other programs tell a mask from its photo, as in 0001_mask.png, mask_0001.png and 0001.jpg.mask.png.
+_MASK_WORDS = re.compile(r"(?:mask|alpha|matte)[-_. ](?P<after>.+)|(?P<before>.+)[-_. ](?:mask|alpha|matte)", re.I)
 
 
-def find_photos(folder: Path) -> list[Path]:
-    """List the photos in the subfolder `images`, or in the folder itself if it has no such subfolder. They are sorted by name.
-
-    A file NAME_alpha.png beside a photo NAME is its mask and is not listed. RAW or EXR is not listed if another image has the same name:
-    many cameras write a photo as RAW and as JPEG.
-    """
-    top = folder / "images" if (folder / "images").is_dir() else folder
-    found = {path.name: path for path in sorted(top.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES}
-    masks = {f"{path.stem}_alpha.png" for path in found.values()}
-    pictures = {path.stem for path in found.values() if path.suffix.lower() in PICTURE_SUFFIXES}
-    return [
-        path
-        for name, path in found.items()
-        if name not in masks and (path.suffix.lower() in PICTURE_SUFFIXES or path.stem not in pictures)
-    ]
+def is_image(name: str) -> bool:
+    """Tell by its suffix whether a file is an image. macOS leaves files ._NAME.jpg that are none."""
+    return not name.startswith(".") and os.path.splitext(name)[1].lower() in _RANKS
 
 
-def all_found(source: Path, found: list[tuple[str, Path | None]]) -> list[Path]:
-    """Return the files of photos. Raises InputError if any are missing.
-
-    `found` has each photo's name and its file, which is None if the photo is missing. `source` is the file or folder that names the photos;
-    the error message begins with it.
-    """
-    missing = [name for name, file in found if file is None]
-    if missing:
-        raise InputError(
-            f"{source}: {len(missing)} of the {len(found)} images it names are missing, the first is {missing[0]}. "
-            "Put them back, or remove them from the file."
-        )
-    return [file for _, file in found if file is not None]
+def fold(name: str) -> str:
+    """Return a name in the form in which names are compared: without letter case, in Unicode's form NFC (macOS writes NFD)."""
+    return unicodedata.normalize("NFC", name).casefold()
 
 
-class Masks:
-    """Find the mask file of each photo of a capture.
+def without_suffix(name: str) -> str:
+    """Return a file name or path without its image suffix. Other dots stay: `render.0001` has none."""
+    stem, suffix = os.path.splitext(name)
+    return stem if suffix.lower() in _RANKS else name
 
-    The mask of NAME.jpg is NAME.png or NAME.jpg.png in the folder `masks`. Other image suffixes than .png are allowed. If photos are in
-    subfolders, their masks are in subfolders of `masks` with the same names. If the folder `masks` has no mask of a photo, NAME_alpha.png
-    beside the photo is used, as in the scene `ball` of Shiny Blender.
+
+def without_mask_word(name: str) -> str:
+    """Return a mask's name, which has no suffix, without the word that tells it from its photo: `0001` for `0001_mask`."""
+    found = _MASK_WORDS.fullmatch(name)
+    return name if found is None else found["after"] or found["before"]
+
+
+class _Listing(NamedTuple):
+    """Hold the names in a folder. `files` and `folders` map folded names to names; `stems` maps images' names without suffix."""
+
+    files: dict[str, list[str]]
+    stems: dict[str, list[str]]
+    folders: dict[str, list[str]]
+
+
+class Files:
+    """Find a capture's files by the names that the capture gives them. Each folder is listed only once.
+
+    A name may differ from the file's: in letter case, in Unicode's form, by `\\` for `/`, or by a missing or other image suffix. It may
+    also be an absolute path on another machine. Whatever name led to a file, its path is the same.
     """
 
     def __init__(self, folder: Path):
         self.folder = folder
-        root = folder / "masks"
-        self.files = {
-            path.relative_to(root).as_posix().removesuffix(path.suffix): path
-            for path in (sorted(root.rglob("*")) if root.is_dir() else [])
-            if path.suffix.lower() in IMAGE_SUFFIXES
-        }
+        self._listings: dict[Path, _Listing] = {}
+        self._folders: dict[tuple[str, ...], Path | None] = {(): folder}
+        self._owned: dict[Path, Path] = {}
 
-    def find(self, image: Path, named: str | None, where: str) -> Path | None:
-        """Return the mask file of the photo `image`, None if it has none.
+    def find(self, name: str, *homes: str, suffixes: bool = True) -> Path | None:
+        """Return the file with a name, which is relative to the capture's folder, or None if it is missing.
 
-        `named` is the mask's path, relative to the capture's folder, if the capture's JSON file gives one. If `named` is empty, the mask is
-        found by the photo's name. Raises InputError if the mask `named` is missing. `where` is a name for the camera in the error message.
+        `homes` are folders in which it is looked for next, such as "images". Of an absolute path that does not exist, ever shorter ends are
+        looked for in the capture's folder, at last the bare name there and in `homes`. Without `suffixes`, the name's suffix must be right.
         """
-        if named:
-            path = find_image(self.folder / named.replace("\\", "/"))
-            if path is None:
-                raise InputError(f"{where}: the mask {named} is missing. Put it back, or remove its mask_path.")
-            return path
-        parts = image.relative_to(self.folder).parts if image.is_relative_to(self.folder) else ()
-        for name in ("/".join(parts), "/".join(parts[1:])):
-            mask = self.files.get(name) or self.files.get(name.removesuffix(image.suffix))
-            if mask is not None:
-                return mask
-        beside = image.with_name(f"{image.stem}_alpha.png")
-        return beside if os.path.isfile(beside) else None
+        for folder, last in self._places(name, homes):
+            if (file := self._pick(folder, last, suffixes)) is not None:
+                return file
+        return None
+
+    def find_folder(self, *parts: str) -> Path | None:
+        """Return a folder inside the capture's by its path, whatever its letter case. Return None if there is none."""
+        if parts not in self._folders:
+            above = self.find_folder(*parts[:-1])
+            self._folders[parts] = None if above is None else self.folder_in(above, parts[-1])
+        return self._folders[parts]
+
+    def folder_in(self, above: Path, name: str) -> Path | None:
+        """Return the folder of that name in another folder, whatever its letter case. Return None if there is none."""
+        names = self._list(above).folders.get(fold(name), [])
+        return above / (name if name in names else min(names)) if names else None
+
+    def images(self, folder: Path) -> list[str]:
+        """List the names of the images in a folder, sorted. Hidden files are left out."""
+        return sorted(name for names in self._list(folder).files.values() for name in names if is_image(name))
+
+    def all_images(self, folder: Path) -> Iterator[Path]:
+        """Yield the images in a folder and the folders in it, sorted within each. Hidden ones are left out."""
+        yield from (folder / name for name in self.images(folder))
+        for inner in self.folders(folder):
+            yield from self.all_images(inner)
+
+    def folders(self, folder: Path) -> list[Path]:
+        """List the folders in a folder, sorted. Hidden ones are left out, and what macOS adds to archives."""
+        names = sorted(name for names in self._list(folder).folders.values() for name in names)
+        inner = [folder / name for name in names if not name.startswith((".", "__MACOSX"))]
+        real = os.path.join(os.path.realpath(folder), "")
+        return [path for path in inner if not real.startswith(os.path.join(os.path.realpath(path), ""))]  # no circles
+
+    def masks_beside(self, folder: Path) -> dict[str, str]:
+        """Return which images of a folder are masks of others, such as 0001_alpha.png, mapped to the photo's folded name without suffix."""
+        stems, masks = self._list(folder).stems, {}
+        for name in (name for names in stems.values() for name in names if is_image(name)):
+            of = without_mask_word(without_suffix(name))
+            if of != without_suffix(name) and (of := fold(without_suffix(of))) in stems:
+                masks[name] = of
+        return masks
+
+    def _places(self, name: str, homes: tuple[str, ...]) -> Iterator[tuple[Path, str]]:
+        """Yield the existing folders in which a file may be, each with the file's name there."""
+        text = name.replace("\\", "/")
+        absolute = text.startswith("/") or re.match(r"[A-Za-z]:", text) is not None
+        path = posixpath.normpath(text)
+        tails = [[part for part in path.split("/") if part not in (".", "..", "") and not part.endswith(":")]]
+        inside = not absolute and not path.startswith("..")
+        if not inside:
+            outside = Path(text) if os.path.isabs(text) else self.folder / path
+            if (not absolute or os.path.isabs(text)) and outside.name:
+                folder = self._own(outside.parent)
+                if os.path.isdir(folder):
+                    yield folder, outside.name
+            tails = [tails[0][start:] for start in range(1, len(tails[0]))] or tails
+        last = tails[0] if inside else tails[-1]
+        for parts in [*tails, *([home, *last] for home in homes)]:
+            if parts and (folder := self.find_folder(*parts[:-1])) is not None:
+                yield folder, parts[-1]
+
+    def _own(self, folder: Path) -> Path:
+        """Return a folder's path as others inside the capture's folder have it, if it is in there."""
+        if folder not in self._owned:
+            real, top = os.path.realpath(folder), os.path.realpath(self.folder)
+            inside = real == top or real.startswith(os.path.join(top, ""))
+            self._owned[folder] = self.folder / os.path.relpath(real, top) if inside else folder
+        return self._owned[folder]
+
+    def _pick(self, folder: Path, name: str, suffixes: bool) -> Path | None:
+        files, stems, _ = self._list(folder)
+        names = files.get(fold(name), [])
+        if suffixes and not names:
+            names = stems.get(fold(name)) or stems.get(fold(without_suffix(name)), [])
+        if not names:
+            return None
+        return folder / (name if name in names else min(names, key=_preference))
+
+    def _list(self, folder: Path) -> _Listing:
+        if folder not in self._listings:
+            self._listings[folder] = listing = _Listing({}, {}, {})
+            with suppress(OSError), os.scandir(folder) as entries:  # it may be unreadable
+                for entry in entries:
+                    with suppress(OSError):  # links in a circle
+                        _sort(entry, listing)
+        return self._listings[folder]
+
+
+def _sort(entry: os.DirEntry, listing: _Listing) -> None:
+    """Add a folder's entry to its listing, unless it is a pipe or a device."""
+    name = entry.name
+    if entry.is_dir():
+        listing.folders.setdefault(fold(name), []).append(name)
+    elif entry.is_file():
+        listing.files.setdefault(fold(name), []).append(name)
+        if is_image(name):
+            listing.stems.setdefault(fold(without_suffix(name)), []).append(name)
+
+
+def _preference(name: str) -> tuple[int, str]:
+    return _RANKS.get(os.path.splitext(name)[1].lower(), len(_RANKS)), name
+
+
+def photo_folder(files: Files) -> Path:
+    """Return the folder of a capture's photos: its `images` or `input` if there are images in it or its folders, else its own."""
+    for name in PHOTO_FOLDERS:
+        folder = files.find_folder(name)
+        if folder is not None and next(files.all_images(folder), None) is not None:
+            return folder
+    return files.folder
+
+
+def find_photos(folder: Path) -> list[Path]:
+    """List the photos in the subfolder `images` or `input` and its subfolders, or in the folder itself if it has no such subfolder.
+
+    They are sorted by name. A mask beside its photo, such as NAME_alpha.png, is not listed. RAW or EXR is not listed if another image in
+    the same folder has the same name: many cameras write a photo as RAW and as JPEG.
+    """
+    files = Files(folder)
+    top = photo_folder(files)
+    return photos_in(files, top, deep=top != folder)
+
+
+def photos_in(files: Files, folder: Path, deep: bool) -> list[Path]:
+    """List the photos in a folder, with `deep` also in the folders in it, as `find_photos` does."""
+    names, masks = files.images(folder), files.masks_beside(folder)
+    pictures = {without_suffix(name) for name in names if name.lower().endswith(PICTURE_SUFFIXES)}
+    found = [
+        folder / name
+        for name in names
+        if name not in masks and (name.lower().endswith(PICTURE_SUFFIXES) or without_suffix(name) not in pictures)
+    ]
+    inner = [path for path in files.folders(folder) if deep and fold(path.name) not in MASK_FOLDERS]
+    return found + [photo for path in inner for photo in photos_in(files, path, deep)]
+
+
+def leave_out_missing(source: Path, found: list[tuple[T, str, Path | None]]) -> tuple[list[tuple[T, Path]], list[str]]:
+    """Leave out photos that were removed, such as blurred ones. Return the others, and a list with a warning if any are missing.
+
+    `found` has, of each photo, anything to return with it, its name, and its file, which is None if the photo is missing. `source` is the
+    file or folder that names the photos. Raises InputError if more than half are missing: it is then another capture's, or was moved.
+    """
+    missing = [name for _, name, file in found if file is None]
+    if 2 * len(missing) > len(found):
+        raise InputError(
+            f"{source}: {len(missing)} of the {len(found)} images it names are missing, the first is {missing[0]}. "
+            "Put them back, or remove them from the file."
+        )
+    left = [(other, file) for other, _, file in found if file is not None]
+    if not missing:
+        return left, []
+    what = f"{len(missing)} of the {len(found)} images in {source.name} are missing and left out, first {missing[0]}"
+    return left, [one_line(what)]
 
 
 def photo_view(

@@ -32,7 +32,20 @@ Image.MAX_IMAGE_PIXELS = None  # `check_pixels` has the limit
 SPARE = 2
 
 # Pillow's names of what a photo's file may be, whatever its suffix. Of Pillow's other formats some start programs, as EPS does.
-FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "HEIF", "BMP", "AVIF", "GIF", "JPEG2000", "PPM", "TGA")
+# With the suffixes by which photos are found in a folder; where a photo is there twice, the first is preferred.
+FORMATS = {
+    "PNG": (".png",),
+    "JPEG": (".jpg", ".jpeg", ".jpe", ".jfif", ".mpo"),
+    "HEIF": (".heic", ".heif", ".hif"),
+    "TIFF": (".tif", ".tiff"),
+    "WEBP": (".webp",),
+    "BMP": (".bmp",),
+    "AVIF": (".avif",),
+    "JPEG2000": (".jp2", ".j2k", ".jpx"),
+    "PPM": (".ppm", ".pgm", ".pbm", ".pnm"),
+    "TGA": (".tga",),
+    "GIF": (".gif",),
+}
 
 ROWS = 128  # that are copied from a decoded picture at a time
 
@@ -177,7 +190,7 @@ def _exr_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def write_for_colmap(path: Path, out: Path) -> bool:
-    """Write a photo's pixels to the JPEG `out` if COLMAP cannot read them: HEIC, WebP, RAW, EXR, or TIFF that is not stored upright.
+    """Write a photo's pixels to the JPEG `out` if COLMAP may not read them: HEIC, RAW, EXR and others, or TIFF not stored upright.
 
     Return whether the JPEG was written. It has the orientation in which `Header` says that the pixels are stored. Raises InputError naming
     the file.
@@ -188,7 +201,7 @@ def write_for_colmap(path: Path, out: Path) -> bool:
         return True
     with _open(path) as picture:
         turned = picture.format == "TIFF" and Image.Image.getexif(picture).get(ExifTags.Base.Orientation, 1) != 1
-        if picture.format not in ("HEIF", "WEBP") and not turned:
+        if picture.format in ("JPEG", "MPO", "PNG", "TIFF", "BMP") and not turned:
             return False
         _decode(picture, path).convert("RGB").save(out, "JPEG", quality=95, subsampling=0)
     return True
@@ -197,16 +210,51 @@ def write_for_colmap(path: Path, out: Path) -> bool:
 def read_mask(path: Path, below: float | None = None) -> np.ndarray:
     """Read a mask file as (H, W) uint8: 255 is the object, 0 the background.
 
-    If the file has an alpha channel that is not opaque everywhere, the alpha channel is the mask. Otherwise the brightness is the mask. A
-    mask with the values 0 and 1 is scaled to 255. If `below` is given, the file is a depth map instead: the object is where depth is less
-    than `below` times the largest possible value.
+    If the file has an alpha channel that is not opaque everywhere, the alpha channel is the mask. Otherwise the brightness is the mask. Of
+    two values of any kind, the smaller is the background and the larger the object. In a coloured palette the smallest index is the
+    background, and all others are objects. If `below` is given, the file is a depth map instead: the object is where depth is less than
+    `below` times the largest possible value.
     """
-    image, alpha = read_image(path)
     if below is not None:
-        return np.where(image[..., 0] < 255 * below, np.uint8(255), np.uint8(0))
-    if alpha is None or alpha.min() == 255:
-        alpha = image.max(axis=2)
-    return alpha * np.uint8(255) if alpha.max() == 1 else alpha
+        return np.where(read_image(path)[0][..., 0] < 255 * below, np.uint8(255), np.uint8(0))
+    values, white = _labels(path), 255
+    if values is None:
+        image, alpha, white = read_codes(path)
+        values = image.max(axis=2)
+        if alpha is not None and alpha.min() < 255:
+            values, white = alpha, 255
+    low, high = values.min(), values.max()
+    if np.all((values == low) | (values == high)):
+        return np.where(values > (low if low < high else 0), np.uint8(255), np.uint8(0))
+    return _as_bytes(values, white)
+
+
+def _labels(path: Path) -> np.ndarray | None:
+    """Read numbers (H, W) that are no brightness, upright: True where a coloured palette's index is an object, or two 32-bit numbers.
+
+    Return None if the image has none. Programs that segment photos write such files.
+    """
+    if _is_raw(path) or _is_exr(path):
+        return None
+    with _open(path) as picture:
+        if picture.mode not in ("P", "I", "F") or picture.has_transparency_data:
+            return None
+        try:
+            values = np.rot90(np.asarray(picture), -_turns(picture))
+        except Exception as error:
+            if is_shortage(error):
+                raise
+            raise InputError(f"{path}: the image is truncated or broken ({reason(error)}). Replace it.") from error
+        if picture.mode != "P":
+            return values if np.isfinite(values).all() and len(np.unique(values)) <= 2 else None
+        colors = np.zeros((256, 3), np.uint8)
+        palette = np.array(picture.getpalette("RGB"), np.uint8).reshape(-1, 3)
+    colors[: len(palette)] = palette
+    used = np.unique(values)
+    shown = colors[used]
+    if np.ptp(shown, axis=1).max() == 0 and len(np.unique(shown, axis=0)) == len(used):
+        return None  # grey
+    return values > (used[0] if len(used) > 1 else 0)
 
 
 def read_alpha(view: View) -> np.ndarray | None:
@@ -276,7 +324,7 @@ def _divisor(shrink: int, width: int, height: int) -> int:
 
 def _open(path: Path) -> ImageFile.ImageFile:
     try:
-        picture = Image.open(path, formats=FORMATS)
+        picture = Image.open(path, formats=tuple(FORMATS))
     except FileNotFoundError:
         raise InputError(f"{path}: the image is missing. Put it back, or remove it from the capture.") from None
     except Exception as error:

@@ -241,7 +241,9 @@ def _inner(view: View, root: Path) -> Path:
 
 def _targets(root: Path, views: list[View]) -> dict[View, Path]:
     """Map each photo without a mask to its mask file NAME.png, or to NAME.jpg.png if photos differ only in their suffix."""
-    names = [_inner(view, root) for view in views]
+    inner = [_inner(view, root) for view in views]
+    twice = Counter(inner)  # as cam1/1.jpg and cam2/1.jpg without a folder images above
+    names = [name if twice[name] == 1 else v.image_path.relative_to(root) for name, v in zip(inner, views, strict=True)]
     stems = Counter(name.with_suffix("") for name in names)
     files = (
         name.with_suffix(".png") if stems[name.with_suffix("")] == 1 else name.with_name(name.name + ".png")

@@ -35,8 +35,9 @@ from refgs.capture.colmap_steps import (
     match_features,
     unexplained_part,
 )
-from refgs.capture.files import Masks, find_photos
+from refgs.capture.files import Files, find_photos, photo_folder
 from refgs.capture.images import read_header, read_mask
+from refgs.capture.mask_files import find_masks
 from refgs.capture.region import WHITE_MASKS, empty_masks
 from refgs.errors import InputError
 from refgs.paths import check_room, disk_errors_named
@@ -54,21 +55,21 @@ WITH_MASKS = (
 
 
 class _Found(NamedTuple):
-    """Hold the names of the photos that got a camera, the mean reprojection error in pixels, and reasons to doubt the cameras.
+    """Hold the photos that got a camera, the mean reprojection error in pixels, and reasons to doubt the cameras.
 
     `unexplained` is the fraction of feature matches that the cameras do not explain. `apart` are the names of the photos in the largest
     other group: these photos fit together, but not to the placed ones. `inside` says that only the pixels inside the masks were used.
     """
 
-    placed: set[str]
+    placed: set[Path]
     error: float
     unexplained: float
-    apart: set[str]
+    apart: set[Path]
     inside: bool
 
 
 def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) -> dict[str, Any]:
-    """Find the cameras of the photos in a folder, or in its subfolder `images`. Write them to the subfolder `sparse/0` as a COLMAP model.
+    """Find the cameras of the photos that `find_photos` lists. Write them to the folder's subfolder `sparse/0` as a COLMAP model.
 
     If these cameras leave much unexplained or there are hardly any, and all photos have masks, cameras are found anew from the pixels
     inside the masks. This is the way for an object on a turntable.
@@ -86,7 +87,9 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
     folder = Path(folder)
     photos = find_photos(folder)
     if len(photos) < 3:
-        raise InputError(f"{folder}: {len(photos)} photos in it or in its images folder; thirty or more are good")
+        raise InputError(
+            f"{folder}: {len(photos)} photos in it or in its folders images and input; thirty or more are good"
+        )
     if find_layout(folder) is not None or (folder / "sparse").exists():
         raise InputError(f"{folder}: it has cameras already; to find them anew remove them (sparse, transforms*.json)")
     for photo in photos:
@@ -103,12 +106,13 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
             _remove(path)
     model = work / "0"
     with disk_errors_named([folder], "search again"):
-        found = _run_colmap_in_child(photos, masks, database, model, report)
+        found = _run_colmap_in_child(photo_folder(Files(folder)), photos, masks, database, model, report)
     placed = found.placed
     if found.apart and len(found.apart) >= len(placed) / 2 and len(placed | found.apart) >= 0.75 * len(photos):
         shutil.rmtree(work)
+        ours, others = min(placed).name, min(found.apart).name
         raise InputError(
-            f"{folder}: the photos are of two sessions: {len(placed)} from {min(placed)} on and {len(found.apart)} from {min(found.apart)} "
+            f"{folder}: the photos are of two sessions: {len(placed)} from {ours} on and {len(found.apart)} from {others} "
             "on share nothing. Put each session in a folder of its own, or add photos that show what both show."
         )
     if not _enough(placed, photos):
@@ -117,7 +121,7 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
             f"{folder}: only {len(placed)} of {len(photos)} photos could be placed. Take more, each showing most of what the one "
             "before it shows, sharp, in unchanging light; lay a patterned mat or newspaper under an object that is plain or shiny."
         )
-    if missing := [photo.name for photo in photos if photo.name not in placed]:
+    if missing := [photo.name for photo in photos if photo not in placed]:
         names = ", ".join(missing[:5]) + (" …" if len(missing) > 5 else "")
         what = f"{len(missing)} of {len(photos)} photos could not be placed and are left out: {names}; more photos between them help"
         if not masks:
@@ -138,7 +142,7 @@ def _remove(path: Path) -> None:
     shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def _enough(placed: set[str], photos: list[Path]) -> bool:
+def _enough(placed: set[Path], photos: list[Path]) -> bool:
     """Return whether enough photos got a camera to make a capture of them."""
     return len(placed) >= max(3, len(photos) / 2)
 
@@ -148,10 +152,10 @@ def _find_masks(folder: Path, photos: list[Path]) -> list[Path]:
 
     Raises InputError if a mask does not have the size of its photo.
     """
-    known = Masks(folder)
-    masks = [mask for photo in photos if (mask := known.find(photo, None, "")) is not None]
-    if len(masks) < len(photos):
+    found = find_masks(Files(folder), photos)
+    if len(found) < len(photos):
         return []
+    masks = [found[photo] for photo in photos]
     for photo, mask in zip(photos, masks, strict=True):
         header, size = read_header(photo), read_header(mask).upright
         if size not in (header.upright, header[:2]):
@@ -185,7 +189,7 @@ def _hash_of_files(files: list[Path]) -> str:
 
 
 def _run_colmap_in_child(
-    photos: list[Path], masks: list[Path], database: Path, model: Path, report: Callable
+    top: Path, photos: list[Path], masks: list[Path], database: Path, model: Path, report: Callable
 ) -> _Found:
     """Run `_run_colmap` in a child process and return its result. The process is ended even if this call is interrupted.
 
@@ -193,7 +197,7 @@ def _run_colmap_in_child(
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_child, args=(photos, masks, database, model, theirs), daemon=True)
+    process = context.Process(target=_child, args=(top, photos, masks, database, model, theirs), daemon=True)
     process.start()
     theirs.close()
     try:
@@ -229,22 +233,25 @@ def end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _child(photos: list[Path], masks: list[Path], database: Path, model: Path, events: Connection) -> None:
+def _child(top: Path, photos: list[Path], masks: list[Path], database: Path, model: Path, events: Connection) -> None:
     """Run `_run_colmap` in a child process. If it raises an InputError, send the error through the pipe `events`.
 
     The child ends when its parent process ends, even if the parent was killed.
     """
     end_with_parent()
     try:
-        _run_colmap(photos, masks, database, model, events)
+        _run_colmap(top, photos, masks, database, model, events)
     except InputError as error:
         events.send(error)
 
 
-def _run_colmap(photos: list[Path], masks: list[Path], database: Path, model: Path, events: Connection) -> None:
+def _run_colmap(
+    top: Path, photos: list[Path], masks: list[Path], database: Path, model: Path, events: Connection
+) -> None:
     """Run COLMAP on the photos and write its model to the folder `model`. Send progress, and at the end a _Found, to the pipe `events`.
 
-    The whole photos are used first. If that fails or its cameras are doubtful, the pixels inside the masks are tried.
+    The model names photos by their paths in the folder `top`. The whole photos are used first. If that fails or its cameras are doubtful,
+    the pixels inside the masks are tried.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     import pycolmap
@@ -264,7 +271,7 @@ def _run_colmap(photos: list[Path], masks: list[Path], database: Path, model: Pa
     if best is not None:
         color_points(best, photos)
         for number in best.reg_image_ids():
-            best.image(number).name = photos[int(best.image(number).name)].name
+            best.image(number).name = photos[int(best.image(number).name)].relative_to(top).as_posix()
         model.mkdir()
         best.write_binary(model)
     events.send(found)
@@ -301,8 +308,6 @@ def _describe(models: list[Any], photos: list[Path], database: Path, inside: boo
     if not models:
         return None, _Found(set(), 0.0, 0.0, set(), inside)
     best = models[0]
-    placed, *groups = (
-        {photos[int(model.image(number).name)].name for number in model.reg_image_ids()} for model in models
-    )
+    placed, *groups = ({photos[int(model.image(number).name)] for number in model.reg_image_ids()} for model in models)
     apart = max((group for group in groups if group.isdisjoint(placed)), key=len, default=set())
     return best, _Found(placed, best.compute_mean_reprojection_error(), unexplained_part(best, database), apart, inside)

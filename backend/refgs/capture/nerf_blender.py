@@ -20,13 +20,17 @@ from refgs.errors import InputError
 from refgs.formats.transforms import read_transforms
 
 
-def read_nerf_blender(folder: Path) -> list[View]:
-    """Read the training and test views (photos with cameras) of a NeRF-Blender capture, in the capture's coordinates. Raises InputError."""
-    views = _read(folder / "transforms_train.json", "train")
+def read_nerf_blender(folder: Path) -> tuple[list[View], list[str]]:
+    """Read the training and test views (photos with cameras) of a NeRF-Blender capture, and warnings. Raises InputError.
+
+    Cameras are in the capture's coordinates.
+    """
+    views, warnings = _read(folder / "transforms_train.json", "train")
     for name in ("transforms_test.json", "transforms_val.json"):
         if (folder / name).is_file():
-            return views + _read(folder / name, "test")
-    return views
+            tested, more = _read(folder / name, "test")
+            return views + tested, warnings + more
+    return views, warnings
 
 
 def published_normals(view: View, max_side: int | None = None) -> tuple[np.ndarray, np.ndarray] | None:
@@ -54,7 +58,8 @@ def published_normals(view: View, max_side: int | None = None) -> tuple[np.ndarr
     return np.where((alpha > 0)[..., None], normals / np.maximum(length, 1e-6), 0), alpha
 
 
-def _read(file: Path, split: Split) -> list[View]:
-    views = read_views(file, [(frame, split) for frame in read_transforms(file).frames])
+def _read(file: Path, split: Split) -> tuple[list[View], list[str]]:
+    views, warnings = read_views(file, [(frame, split) for frame in read_transforms(file).frames])
     normals = [view.image_path.with_name(f"{view.image_path.stem}_normal.png") for view in views]
-    return [replace(v, normal_path=n) if n.is_file() else v for v, n in zip(views, normals, strict=True)]
+    views = [replace(v, normal_path=n) if n.is_file() else v for v, n in zip(views, normals, strict=True)]
+    return views, warnings

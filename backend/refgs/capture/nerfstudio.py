@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from refgs.capture.files import find_image
+from refgs.capture.files import PHOTO_FOLDERS, Files
 from refgs.capture.transforms import read_views
 from refgs.capture.types import Split, View
 from refgs.errors import InputError
 from refgs.formats.colmap import FARTHEST
 from refgs.formats.ply import read_ply
-from refgs.formats.transforms import Frame, Transforms, read_transforms
+from refgs.formats.transforms import Frame, read_transforms
 
 
 def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None, list[str]]:
@@ -24,34 +24,25 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.nda
     """
     file = folder / "transforms.json"
     found = read_transforms(file)
-    train = None if found.train_filenames is None else set(found.train_filenames)
-    test = set(found.test_filenames or found.val_filenames or ())
+    files = Files(folder)
+
+    def photo(name: str) -> Path | str:
+        return files.find(name, *PHOTO_FOLDERS) or name
+
+    train = None if found.train_filenames is None else {photo(name) for name in found.train_filenames}
+    test = {photo(name) for name in found.test_filenames or found.val_filenames or ()}
 
     def split(frame: Frame) -> Split | None:
-        if frame.file_path in test:
-            return "test"
-        return "train" if train is None or frame.file_path in train else None
+        named = photo(frame.file_path)
+        return "test" if named in test else "train" if train is None or named in train else None
 
-    frames, warnings = _without_deleted(found, file)
-    views = read_views(file, [(frame, which) for frame in frames if (which := split(frame)) is not None])
-    points, colors = _read_points(folder / found.ply_file_path) if found.ply_file_path else (None, None)
+    views, warnings = read_views(
+        file, [(frame, which) for frame in found.frames if (which := split(frame)) is not None]
+    )
+    points, colors = None, None
+    if found.ply_file_path:
+        points, colors = _read_points(files.find(found.ply_file_path, suffixes=False) or folder / found.ply_file_path)
     return views, points, colors, warnings
-
-
-def _without_deleted(found: Transforms, file: Path) -> tuple[list[Frame], list[str]]:
-    """Drop frames whose photos are missing, but only from instant-ngp's files. Return the frames that are left, and warnings.
-
-    Users of instant-ngp delete blurred photos and leave their frames in the file; instant-ngp ignores these frames. All frames are returned
-    if another program wrote the file, or if more than half of the photos are missing. If a photo is missing then, the caller raises an
-    error that names it.
-    """
-    frames = found.frames
-    missing = [frame.path for frame in frames if find_image(file.parent / frame.path) is None]
-    if not found.of_instant_ngp or not missing or 2 * len(missing) > len(frames):
-        return frames, []
-    kept = [frame for frame in frames if frame.path not in set(missing)]
-    warning = f"{len(missing)} of the {len(frames)} images in {file.name} are missing and left out, first {missing[0]}"
-    return kept, [warning]
 
 
 def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:

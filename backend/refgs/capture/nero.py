@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from refgs.camera import Camera
-from refgs.capture.files import all_found, photo_view
+from refgs.capture.files import Files, leave_out_missing, photo_view
 from refgs.capture.images import read_header
 from refgs.capture.lens import check_intrinsics
 from refgs.capture.pickles import read_pair
@@ -27,18 +27,19 @@ def read_nero(folder: Path) -> tuple[list[View], list[str]]:
     """Read a NeRO capture. Return its views (photos with cameras) in NeRO's coordinates, and warnings. Raises InputError."""
     names = (file.name.removesuffix("-camera.pkl") for file in folder.glob("*-camera.pkl"))
     numbers = sorted(int(name) for name in names if name.isdecimal())
-    named = [folder / f"{number}.png" for number in numbers]
-    photos = all_found(folder, [(photo.name, photo if photo.is_file() else None) for photo in named])
+    files = Files(folder)
+    found = [(number, f"{number}.png", files.find(f"{number}.png")) for number in numbers]
+    photos, lost = leave_out_missing(folder, found)
     tested, warnings = _test_numbers(folder, numbers)
     views = []
-    for number, photo in zip(numbers, photos, strict=True):
+    for number, photo in photos:
         file = folder / f"{number}-camera.pkl"
-        depth = folder / f"{number}-depth.png"
+        depth = files.find(f"{number}-depth.png", suffixes=False)
         split = "test" if number in tested else "train"
         camera = _camera(file, str(number), *read_header(photo)[:2])
-        mask, below = (depth, FAR) if depth.is_file() else (None, None)
+        mask, below = (depth, FAR) if depth is not None else (None, None)
         views.append(photo_view(photo, (camera, None), split, mask, str(file), mask_below=below))
-    return views, warnings
+    return views, [*warnings, *lost]
 
 
 def _camera(file: Path, name: str, width: int, height: int) -> Camera:

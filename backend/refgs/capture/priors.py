@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from refgs.camera import Camera
-from refgs.capture.files import PICTURE_SUFFIXES
+from refgs.capture.files import PICTURE_SUFFIXES, Files, fold
 from refgs.capture.images import read_codes
 from refgs.capture.reduce import reduced_map
 from refgs.capture.types import View
@@ -45,9 +45,10 @@ def with_priors(views: list[View], root: Path) -> list[View]:
 
     No file is opened. A file whose name fits no photo is ignored.
     """
-    for folder, field in FOLDERS.items():
-        if (root / folder).is_dir():
-            found = _find(views, root, root / folder)
+    files = Files(root)
+    for name, field in FOLDERS.items():
+        if (folder := files.find_folder(name)) is not None:
+            found = _find(views, root, folder)
             views = [replace(view, **{field: found.get(view)}) for view in views]
     return views
 
@@ -63,13 +64,13 @@ def _find(views: list[View], root: Path, folder: Path) -> dict[View, Path]:
         parts = view.image_path.relative_to(root).parts if view.image_path.is_relative_to(root) else ()
         for path in (Path(*some) for some in (parts, parts[1:]) if some):
             for name in (path.as_posix(), path.with_suffix("").as_posix()):
-                others = named.setdefault(name, [])
+                others = named.setdefault(fold(name), [])
                 if view.split == "train" or not others:
                     others.append(view)
     found: dict[View, list[Path]] = {}
     for file in sorted(folder.rglob("*")):
-        if file.suffix.lower() in SUFFIXES:
-            name = file.relative_to(folder).as_posix().removesuffix(file.suffix)
+        if file.suffix.lower() in SUFFIXES and not file.name.startswith("."):
+            name = fold(file.relative_to(folder).as_posix().removesuffix(file.suffix))
             while name not in named and (shorter := re.sub(r"[-_.][^-_./]*$", "", name)) != name:
                 name = shorter
             if len(named.get(name, ())) == 1 and named[name][0].split == "train":

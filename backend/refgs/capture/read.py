@@ -10,7 +10,7 @@ import numpy as np
 
 from refgs.capture.box import Box
 from refgs.capture.colmap import capture_root, find_model, read_colmap
-from refgs.capture.files import find_photos
+from refgs.capture.files import Files, find_photos, photos_in
 from refgs.capture.nerf_blender import read_nerf_blender
 from refgs.capture.nerfstudio import read_nerfstudio
 from refgs.capture.nero import read_nero
@@ -119,9 +119,16 @@ def _check_layout(folder: Path) -> str:
     if photos := find_photos(folder):
         search = command_line("refgs", "poses", folder)
         raise NoCameras(f"{folder}: {len(photos)} photos, but no cameras. Find them first: {search}")
+    files = Files(folder)
+    if inner := [path.name for path in files.folders(folder) if photos_in(files, path, deep=True)]:
+        where = f"in {inner[0]}" if len(inner) == 1 else f"in {len(inner)} folders, first {inner[0]}"
+        raise InputError(
+            f"{folder}: no capture here, but there are photos {where}. Name the one that is a capture; "
+            "if they are photos of one object, put their folders into a folder images."
+        )
     raise InputError(
         f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender, Stanford-ORB), transforms.json "
-        "(nerfstudio, instant-ngp), sparse/0 (COLMAP), 0-camera.pkl (NeRO), train_000/metadata.json (TensoIR), and for "
+        "(nerfstudio, instant-ngp), sparse/0 and the like (COLMAP), 0-camera.pkl (NeRO), train_000/metadata.json (TensoIR), and for "
         "photos, here and in images. "
         "Name the folder that holds them."
     )
@@ -135,16 +142,18 @@ def _read(folder: Path, layout: str) -> tuple[list[View], np.ndarray | None, np.
     """
     match layout:
         case "nerf-blender":
-            return read_nerf_blender(folder), None, None, []
+            views, warnings = read_nerf_blender(folder)
+            return views, None, None, warnings
         case "stanford-orb":
-            return read_stanford_orb(folder), None, None, []
+            views, warnings = read_stanford_orb(folder)
+            return views, None, None, warnings
         case "tensoir":
             views, warnings = read_tensoir(folder)
             return views, None, None, warnings
         case "nerfstudio":
             return read_nerfstudio(folder)
         case "colmap" if (model := find_model(folder)) is not None:
-            return *read_colmap(*model), []
+            return read_colmap(model)
     views, warnings = read_nero(folder)
     return views, None, None, warnings
 

@@ -13,6 +13,7 @@ import os
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
+from refgs.capture.files import without_suffix
 from refgs.capture.transforms import read_views
 from refgs.capture.types import Split, View
 from refgs.formats.transforms import Frame, read_novel_transforms, read_transforms
@@ -20,35 +21,36 @@ from refgs.formats.transforms import Frame, read_novel_transforms, read_transfor
 NOVEL = "transforms_novel.json"
 
 
-def read_stanford_orb(folder: Path) -> list[View]:
-    """Read the training and test views of a Stanford-ORB capture, in the capture's coordinates. Raises InputError."""
-    return [view for split in ("train", "test") for view in _read(folder / f"transforms_{split}.json", split)]
+def read_stanford_orb(folder: Path) -> tuple[list[View], list[str]]:
+    """Read the training and test views of a Stanford-ORB capture, in the capture's coordinates, and warnings. Raises InputError."""
+    (trained, lost), (tested, more) = (_read(folder / f"transforms_{split}.json", split) for split in ("train", "test"))
+    return trained + tested, lost + more
 
 
 def novel_views(folder: Path) -> list[tuple[str, View]]:
-    """Read the photos of the same object in other scenes, each with the name of its scene. Scenes that are not on disk are left out.
+    """Read the photos of the same object in other scenes, each with the name of its scene. Those not on disk are left out.
 
     The cameras are in the coordinates of the capture in `folder`. Raises InputError.
     """
     file = folder / NOVEL
-    frames, scenes = [], []
+    scenes: dict[str, list[tuple[Frame, Split]]] = {}
     for frame in read_novel_transforms(file).frames:
         scene = frame.scene_name
         if os.path.isdir(folder.parent / scene):
             path = f"../{scene}/{PurePosixPath(frame.path)}"
-            frames.append((_masked(frame.model_copy(update={"file_path": path})), "test"))
-            scenes.append(scene)
+            scenes.setdefault(scene, []).append((_masked(frame.model_copy(update={"file_path": path})), "test"))
     return [
         (scene, replace(view, camera=replace(view.camera, name=f"{scene}_{view.camera.name}")))
-        for scene, view in zip(scenes, read_views(file, frames), strict=True)
+        for scene, frames in scenes.items()
+        for view in read_views(file, frames)[0]
     ]
 
 
-def _read(file: Path, split: Split) -> list[View]:
+def _read(file: Path, split: Split) -> tuple[list[View], list[str]]:
     return read_views(file, [(_masked(frame), split) for frame in read_transforms(file).frames])
 
 
 def _masked(frame: Frame) -> Frame:
     """Add the path of the frame's mask."""
-    path = PurePosixPath(frame.path)
-    return frame.model_copy(update={"mask_path": f"{path.parent}_mask/{path.stem}.png"})
+    path = PurePosixPath(without_suffix(frame.path))
+    return frame.model_copy(update={"mask_path": f"{path.parent}_mask/{path.name}.png"})

@@ -17,7 +17,7 @@ folder further up. The views `val_000` … are not used.
 
 from pathlib import Path
 
-from refgs.capture.files import all_found, photo_view
+from refgs.capture.files import leave_out_missing, photo_view
 from refgs.capture.images import read_header
 from refgs.capture.transforms import frame_camera
 from refgs.capture.types import Split, View
@@ -41,12 +41,12 @@ def is_tensoir(folder: Path) -> bool:
 def read_tensoir(folder: Path) -> tuple[list[View], list[str]]:
     """Read a TensoIR capture. Return its training and test views, in the capture's coordinates, and warnings. Raises InputError."""
     found = _folders(folder, "train") + _folders(folder, "test")
-    photos = all_found(folder, [(f"{view.name}/{PHOTOS[0]}", _photo(view)) for view, _ in found])
-    warnings = []
+    named = [(pair, f"{pair[0].name}/{PHOTOS[0]}", _photo(pair[0])) for pair in found]
+    photos, warnings = leave_out_missing(folder, named)
     if light_folder(folder) is None:
         what = "Environment_Maps is neither beside the scene's folder nor above it"
         warnings.append(f"{what}: the evaluation does not relight without its panoramas")
-    return [_view(view, photo, split) for (view, split), photo in zip(found, photos, strict=True)], warnings
+    return [_view(view, photo, split) for (view, split), photo in photos], warnings
 
 
 def _folders(folder: Path, split: Split) -> list[tuple[Path, Split]]:

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from refgs.camera import Camera
-from refgs.capture.files import IMAGE_SUFFIXES, Masks, all_found, find_image, photo_view
+from refgs.capture.files import PHOTO_FOLDERS, Files, leave_out_missing, photo_view, without_suffix
 from refgs.capture.images import read_header
 from refgs.capture.lens import BROWN, Lens, check_intrinsics
+from refgs.capture.mask_files import find_masks
 from refgs.capture.poses import OPENGL_TO_OPENCV, world_to_camera
 from refgs.capture.types import Split, View
 from refgs.errors import InputError
@@ -102,28 +103,30 @@ def _says_perspective(value: object) -> bool:
     return not value
 
 
-def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> list[View]:
-    """Make a view (a photo with its camera) of each frame. Cameras are in the file's coordinates; photo paths are relative to its folder.
+def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> tuple[list[View], list[str]]:
+    """Make a view (a photo with its camera) of each frame whose photo is there. Return them, and warnings of what was left out.
 
-    `frames` are pairs of a frame and its split, "train" or "test". Raises InputError.
+    Cameras are in the file's coordinates; photo paths are relative to its folder. `frames` are pairs of a frame and its split, "train" or
+    "test". Raises InputError.
     """
-    folder = file.parent
-    found = all_found(file, [(frame.path, find_image(folder / frame.path)) for frame, _ in frames])
-    masks = Masks(folder)
+    files = Files(file.parent)
+    named = [(pair, pair[0].path, files.find(pair[0].path, *PHOTO_FOLDERS)) for pair in frames]
+    found, warnings = leave_out_missing(file, named)
+    masks = find_masks(files, [image for (frame, _), image in found if not frame.mask_path])
     views = []
-    for (frame, split), image in zip(frames, found, strict=True):
-        named = where(file, frame)
-        mask = masks.find(image, frame.mask_path, named)
-        camera = frame_camera(frame, named, read_header(image)[:2])
-        views.append(photo_view(image, camera, split, mask, named))
-    return views
+    for (frame, split), image in found:
+        at = where(file, frame)
+        mask = masks.get(image)
+        if frame.mask_path and (mask := files.find(frame.mask_path, "masks")) is None:
+            raise InputError(f"{at}: the mask {frame.mask_path} is missing. Put it back, or remove its mask_path.")
+        camera = frame_camera(frame, at, read_header(image)[:2])
+        views.append(photo_view(image, camera, split, mask, at))
+    return views, warnings
 
 
 def camera_name(path: str) -> str:
     """Return the name of a frame's camera: the last part of its `file_path`, without an image suffix."""
-    name = path.replace("\\", "/").rsplit("/", 1)[-1]
-    stem, dot, suffix = name.rpartition(".")
-    return stem if dot and f".{suffix.lower()}" in IMAGE_SUFFIXES else name
+    return without_suffix(path.replace("\\", "/").rsplit("/", 1)[-1])
 
 
 def _focal(focal: float | None, angle: float | None, size: float) -> float | None:

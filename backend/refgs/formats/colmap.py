@@ -82,6 +82,11 @@ def read_images(file: Path) -> list[Image]:
     return _parse(file, _binary_images, _text_images)
 
 
+def count_images(file: Path) -> int:
+    """Count a COLMAP model's images, as `read_images` would read them. Raises InputError for a broken file."""
+    return _parse(file, lambda file: _Reader(file).take("Q")[0], lambda file: len(_text_images(file)))
+
+
 def read_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read the points (M, 3) of a COLMAP model and their colours (M, 3), sRGB-encoded in 0..1. Raises InputError for a broken file.
 

@@ -95,13 +95,7 @@ class Transforms(_Cameras):
     test_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
     ply_file_path: str | None = None
-    aabb_scale: Any = None
     to_capture: Matrix | None = None  # of a run's cameras.json: from the run's frame to the capture's
-
-    @property
-    def of_instant_ngp(self) -> bool:
-        """Tell whether instant-ngp wrote the file: its files have the key `aabb_scale`."""
-        return "aabb_scale" in self.model_fields_set
 
 
 class RunFrame(Frame):

@@ -1,0 +1,104 @@
+"""Keep the paths in a .blend relative to it (`//`), so that a copied project works in its own run and capture, not in the original's.
+
+Paths are absolute while a file is open, and relative only in the file. Blender itself does this for images, but not for properties.
+"""
+
+import os
+from collections.abc import Callable, Iterator
+
+import bpy
+
+from .scene.camera_objects import PHOTO
+from .scene.capture_cameras import CAPTURE
+from .scene.run_parts import FOLDER
+from .scene.strokes import STROKES
+
+
+def _change(change: Callable[[str], str]) -> None:
+    """Change all paths that the add-on stores, other than those of linked data, which are not saved."""
+    for item, key in _custom_properties():
+        item[key] = change(item[key])
+    for settings, key in _settings():
+        old = getattr(settings, key)
+        if old and (new := change(old)) != old:
+            setattr(settings, key, new)
+
+
+def _custom_properties() -> Iterator[tuple[bpy.types.ID, str]]:
+    for items in (bpy.data.collections, bpy.data.cameras, bpy.data.images):
+        for item in items:
+            for key in (FOLDER, CAPTURE, PHOTO, STROKES):
+                if isinstance(item.get(key), str) and item[key] and item.library is None:
+                    yield item, key
+
+
+def _settings() -> Iterator[tuple[bpy.types.PropertyGroup, str]]:
+    for scene in bpy.data.scenes:
+        if scene.library is None:
+            yield from ((scene.refgs, "capture"), (scene.refgs, "out"))
+            yield from ((scene.refgs.many, "captures"), (scene.refgs.many, "results"))
+            yield from ((known, key) for known in scene.refgs.runs for key in ("folder", "capture"))
+
+
+def _absolute(path: str, start: str) -> str:
+    return os.path.normpath(bpy.path.abspath(path, start=start)) if path.startswith("//") and start else path
+
+
+def _relative(path: str, start: str) -> str:
+    try:
+        return bpy.path.relpath(path, start=start) if os.path.isabs(path) else path
+    except ValueError:  # on another drive
+        return path
+
+
+@bpy.app.handlers.persistent
+def _before_saving(file: str, *_) -> None:
+    before, after = os.path.dirname(bpy.data.filepath), os.path.dirname(file)
+    if (
+        before
+    ):  # Blender makes the paths of images relative when a file is saved first, and then keeps relative ones right
+        runs = tuple(os.path.join(item[key], "") for item, key in _custom_properties() if key == FOLDER)
+        for image in bpy.data.images:
+            if image.library is None and image.filepath.startswith(runs):
+                image.filepath_raw = _relative(image.filepath, before)
+    if after:  # else it is the startup file
+        _change(lambda path: _relative(_absolute(path, before), after))
+
+
+@bpy.app.handlers.persistent
+def _after_saving(file: str, *_) -> None:
+    _change(lambda path: _absolute(path, os.path.dirname(file)))
+
+
+@bpy.app.handlers.persistent
+def _after_loading(*_) -> None:
+    _change(lambda path: _absolute(path, os.path.dirname(bpy.data.filepath)))
+
+
+@bpy.app.handlers.persistent
+def _after_appending(context, *_) -> None:
+    """Make the paths of what was appended from another .blend absolute. All others are absolute."""
+    libraries = [item.source_library for item in context.import_items if item.source_library is not None]
+    if libraries:
+        start = os.path.dirname(bpy.path.abspath(libraries[0].filepath))
+        for item, key in _custom_properties():
+            item[key] = _absolute(item[key], start)
+
+
+_HANDLERS = {
+    "save_pre": _before_saving,
+    "save_post": _after_saving,
+    "save_post_fail": _after_saving,
+    "load_post": _after_loading,
+    "blend_import_post": _after_appending,
+}
+
+
+def register() -> None:
+    for event, handler in _HANDLERS.items():
+        getattr(bpy.app.handlers, event).append(handler)
+
+
+def unregister() -> None:
+    for event, handler in _HANDLERS.items():
+        getattr(bpy.app.handlers, event).remove(handler)
