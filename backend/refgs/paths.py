@@ -6,12 +6,14 @@ import os
 import re
 import secrets
 import shlex
+import stat
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from refgs.errors import InputError, TryAgain
 
@@ -95,9 +97,7 @@ def write_text(file: Path, text: str, durable: bool = True) -> None:
 def read_text(file: Path, again: str) -> str:
     """Read a text file. Raises InputError if it is missing, not UTF-8 text, or larger than LARGEST. `again` ends the error's message."""
     try:
-        if _is_special(file):
-            raise InputError(f"{file}: this is not a file. {again}")
-        with file.open("rb") as source:
+        with open_file(file) as source:
             data = source.read(LARGEST + 1)
         if len(data) > LARGEST:
             raise InputError(f"{file}: larger than such a file can be. {again}")
@@ -110,9 +110,36 @@ def read_text(file: Path, again: str) -> str:
         raise InputError(f"{file}: cannot be read ({error.strerror}). {again}") from None
 
 
-def _is_special(file: Path) -> bool:
-    """Tell whether a path is a folder, a pipe or a device. A pipe or device may have no end."""
-    return file.exists() and not file.is_file()
+def open_file(file: str | os.PathLike) -> BinaryIO:
+    """Open an ordinary file to read its bytes.
+
+    Raises OSError if it cannot be read, or if it is a folder, a pipe, a socket or a device, which may have no end.
+    """
+    _check_kind(os.stat(file), file)  # first: opening is what starts some devices
+    # Another may have taken its place since. A pipe without a writer is not waited for.
+    opened = os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    try:
+        _check_kind(os.fstat(opened), file)
+        return open(opened, "rb")
+    except BaseException:
+        os.close(opened)
+        raise
+
+
+def check_file(file: str | os.PathLike) -> None:
+    """Raise OSError if a library must not open a path: it has to be an ordinary file, and not empty.
+
+    Linux's /proc has files that count as ordinary and empty, but may have no end.
+    """
+    facts = os.stat(file)
+    _check_kind(facts, file)
+    if not facts.st_size:
+        raise OSError(errno.EINVAL, "the file is empty", str(file))
+
+
+def _check_kind(facts: os.stat_result, file: str | os.PathLike) -> None:
+    if not stat.S_ISREG(facts.st_mode):
+        raise OSError(errno.EINVAL, "this is not a file", str(file))
 
 
 def hash_file(file: Path, kind: Callable = hashlib.blake2b) -> "hashlib._Hash":
@@ -120,20 +147,14 @@ def hash_file(file: Path, kind: Callable = hashlib.blake2b) -> "hashlib._Hash":
 
     Raises OSError if the file cannot be read, or if it is a folder, a pipe or a device.
     """
-    _check_ordinary(file)
-    with open(file, "rb") as opened:
+    with open_file(file) as opened:
         return hashlib.file_digest(opened, kind)
 
 
 def read_bytes(file: Path) -> bytes:
     """Read a file. Raises OSError if it cannot be read, or if it is a folder, a pipe or a device."""
-    _check_ordinary(file)
-    return file.read_bytes()
-
-
-def _check_ordinary(file: Path) -> None:
-    if _is_special(file):
-        raise OSError(errno.EINVAL, "this is not a file", str(file))
+    with open_file(file) as opened:
+        return opened.read()
 
 
 @contextmanager

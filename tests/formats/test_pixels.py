@@ -1,9 +1,11 @@
 """Test that pictures are refused by the size that they declare, before they are decoded, and that large photos are not."""
 
+import shutil
 import struct
 import sys
 import zlib
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -12,6 +14,7 @@ from refgs.capture.images import read_codes, read_header, read_image, read_mask
 from refgs.errors import InputError
 from refgs.formats.exr import read_exr, write_exr
 from refgs.formats.panorama import read_environment
+from refgs.formats.pixels import decode, read_png
 from tests.makers import fuzz
 from tests.makers.captures import write, write_as_phone
 
@@ -127,3 +130,28 @@ def test_a_panorama_is_no_larger_than_its_pixels(tmp_path):
         file.truncate(30 << 30)  # without taking room on the disk
     with pytest.raises(InputError, match="larger than its picture"):
         read_environment(path)
+
+
+def test_opencv_is_given_no_other_kinds_than_png_tiff_and_radiance(tmp_path, monkeypatch):
+    """Check that JPEG 2000 never reaches OpenCV's decoder, by whatever name: that of 4.11 writes out of bounds (CVE-2025-53644)."""
+    given = []
+    known = cv2.imdecode
+    monkeypatch.setattr(cv2, "imdecode", lambda data, flags: (given.append(bytes(data[:4])), known(data, flags))[1])
+    Image.new("RGB", (16, 8), "red").save(tmp_path / "a.jp2")
+    for name in ("a.hdr", "a.png", "a.tif"):
+        shutil.copy(tmp_path / "a.jp2", tmp_path / name)
+        assert decode(tmp_path / name, cv2.IMREAD_UNCHANGED) is None
+    assert read_png(tmp_path / "a.png") is None
+    with pytest.raises(InputError, match=r"a\.hdr: this is not a Radiance picture"):
+        read_environment(tmp_path / "a.hdr")
+    assert given == []
+    write(tmp_path / "b.png", np.full((8, 16, 3), 7, np.uint16))
+    assert decode(tmp_path / "b.png", cv2.IMREAD_UNCHANGED).max() == 7 and given == [b"\x89PNG"]
+
+
+def test_only_pngs_of_runs_are_shown(tmp_path):
+    Image.new("RGB", (16, 8), "red").save(tmp_path / "a.jpg")
+    shutil.copy(tmp_path / "a.jpg", tmp_path / "b.png")
+    write(tmp_path / "c.png", np.full((8, 16, 3), 7, np.uint8))
+    assert read_png(tmp_path / "b.png") is None and read_png(tmp_path / "gone.png") is None
+    assert read_png(tmp_path / "c.png").shape == (8, 16, 3)

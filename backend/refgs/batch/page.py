@@ -11,6 +11,7 @@ import cv2
 
 from refgs import __version__
 from refgs.errors import InputError
+from refgs.formats.pixels import read_png
 from refgs.paths import write_text
 from refgs.report.figures import HEADLINE, duration, flatten
 from refgs.report.page import template
@@ -96,7 +97,7 @@ def picture_of(run: Path) -> Path | None:
 
 def _small(file: Path | None) -> str:
     """Return a picture, reduced to SIDE pixels, as a data URL. Return "" if there is none."""
-    image = None if file is None else cv2.imread(str(file), cv2.IMREAD_COLOR)
+    image = None if file is None else read_png(file, cv2.IMREAD_COLOR)
     if image is None:
         return ""
     scale = min(SIDE / max(image.shape[:2]), 1)

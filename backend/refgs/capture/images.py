@@ -21,7 +21,7 @@ from refgs.capture.reduce import encode, reduced
 from refgs.capture.types import View
 from refgs.errors import InputError, reason
 from refgs.formats.exr import read_exr, read_exr_header
-from refgs.formats.pixels import check_chunks, check_photo, check_pixels
+from refgs.formats.pixels import check_chunks, check_photo, check_pixels, decode
 from refgs.memory import is_shortage
 
 register_heif_opener()  # Pillow opens HEIC then
@@ -385,7 +385,7 @@ def _decode_16_bit(picture: ImageFile.ImageFile, path: Path) -> np.ndarray | Non
     size = picture.size
     _decode(picture, path)
     check_chunks(path)
-    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    pixels = decode(path, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16 or pixels.shape[1::-1] != size:
         return None
     channels = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}

@@ -3,15 +3,19 @@
 import os
 import re
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from refgs.errors import InputError, InputWarning
 from refgs.formats.exr import read_exr
-from refgs.formats.pixels import check_pixels
+from refgs.formats.pixels import check_pixels, decode
+from refgs.paths import open_file
 
-HEADER = 1 << 16  # bytes in which the header of a Radiance picture ends
+HEADER = 1 << 16  # bytes of a Radiance picture in which its size is looked for
+# A larger one than a panorama of 8192×4096, with so many pixels a byte, is taken for a broken one. A pixel takes 24 bytes of memory.
+_FEWEST = 40_000_000, 4
 
 
 def read_environment(path: str | os.PathLike) -> np.ndarray:
@@ -38,17 +42,15 @@ def _read_radiance(path: Path) -> np.ndarray:
 
     if not path.is_file():
         raise InputError(f"{path} is missing")
-    try:
-        with path.open("rb") as file:  # the size is in the header's last line
-            if size := re.search(rb"\n[-+]Y +(\d{1,9}) +[-+]X +(\d{1,9})\n", file.read(HEADER)):
-                check_pixels(path, int(size[2]), int(size[1]))
-                if path.stat().st_size > HEADER + 8 * int(size[1]) * int(
-                    size[2]
-                ):  # a pixel has 4 bytes, or 8 packed badly
-                    raise InputError(f"{path}: the file is larger than its picture. Download it again.")
-        pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if size else None
-    except (cv2.error, OSError):  # an empty file; a disk that fails
-        pixels = None
+    pixels = None
+    with suppress(OSError), open_file(path) as file:
+        # The size is in the header's last line.
+        if size := re.search(rb"\n[-+]Y +(\d{1,9}) +[-+]X +(\d{1,9})\n", file.read(HEADER)):
+            width, height = int(size[2]), int(size[1])
+            check_pixels(path, width, height, *_FEWEST)
+            if path.stat().st_size > HEADER + 8 * width * height:  # runs of one pixel take twice a pixel's 4 bytes
+                raise InputError(f"{path} is larger than its {width}×{height} pixels can be. Download it again.")
+            pixels = decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if pixels is None or pixels.dtype != np.float32:
         raise InputError(f"{path}: this is not a Radiance picture that can be read. Download it again.")
     return pixels[..., ::-1]

@@ -1,8 +1,15 @@
-"""Refuse pictures by the size that they declare, before memory is taken for their pixels."""
+"""Refuse pictures by the size that they declare, before memory is taken for their pixels. Decode some by OpenCV."""
 
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
+
 from refgs.errors import InputError
+from refgs.paths import check_file, open_file
+
+# First bytes of what OpenCV is given: PNG, TIFF of either endianness, Radiance. By these it chooses the decoder, whatever a file's name.
+_DECODED = (b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"#?RADIANCE", b"#?RGBE")
 
 MOST = 256_000_000  # pixels; cameras take up to 200 million, or 240 by shifting the sensor. Decoding takes 7 bytes or more a pixel
 # A larger picture in a file so small that this many pixels share a byte is taken for a broken one. A PNG of one colour has 1032 to 8256, by
@@ -45,7 +52,7 @@ def check_chunks(path: Path) -> None:
     A PNG is 8 bytes and then chunks: a length, a name, that many bytes of data, and a checksum (PNG specification, 5.3).
     """
     size = path.stat().st_size
-    with open(path, "rb") as file:
+    with open_file(path) as file:
         if file.read(8) != b"\x89PNG\r\n\x1a\n":
             return
         name = b""
@@ -54,3 +61,34 @@ def check_chunks(path: Path) -> None:
             if file.tell() + length > size:
                 raise InputError(f"{path}: the image is truncated or broken. Replace it.")
             file.seek(length + 4, 1)
+
+
+def read_png(path: Path, flags: int = -1) -> np.ndarray | None:
+    """Read a PNG of a run as `cv2.imread` does. Return None if it is missing, broken, too large, or no PNG."""
+    try:
+        check_file(path)
+        with Image.open(path, formats=("PNG",)) as picture:
+            check_pixels(path, *picture.size)
+        check_chunks(path)
+        return decode(path, flags)
+    except Exception:  # Pillow's have no common class
+        return None
+
+
+def decode(path: Path, flags: int) -> np.ndarray | None:
+    """Decode a PNG, TIFF or Radiance picture as `cv2.imread` does. Return None if it is broken or another kind of picture.
+
+    OpenCV would read many more kinds, by decoders that nobody needs here. That of JPEG 2000 in 4.11 writes out of bounds (CVE-2025-53644).
+    Raises OSError if the file cannot be read.
+    """
+    import cv2  # here, because most lights are EXR
+
+    with open_file(path) as file:
+        if not file.read(16).startswith(_DECODED):
+            return None
+        file.seek(0)
+        data = np.frombuffer(file.read(), np.uint8)
+    try:
+        return cv2.imdecode(data, flags)
+    except cv2.error:
+        return None

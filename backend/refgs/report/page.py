@@ -23,17 +23,16 @@ from pathlib import Path
 import cv2
 import jinja2
 import numpy as np
-from PIL import Image
 
 from refgs import __version__
 from refgs.errors import InputError, one_line
 from refgs.formats import history
 from refgs.formats.metrics import Metrics, read_metrics
 from refgs.formats.needs import Needs, Row
-from refgs.formats.pixels import check_chunks, check_pixels
+from refgs.formats.pixels import read_png
 from refgs.formats.run_toml import Summary
 from refgs.formats.validate import parse_toml, read_json, validated
-from refgs.paths import disk_errors_named, make_folders, read_text, write_text
+from refgs.paths import disk_errors_named, make_folders, read_bytes, read_text, write_text
 from refgs.report.charts import PARTS, error_chart, parts_chart
 from refgs.report.curves import QUANTITIES, Curve, as_csv, curve, knee, levels, time_to
 from refgs.report.figures import DETAILS, HEADLINE, RELIT, Quantity, duration, flatten, is_number, relit_pair
@@ -229,18 +228,12 @@ def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[
 
 def _embed(path: Path) -> str:
     """Return a picture as a data URL, scaled down to LARGEST_SIDE pixels. Return "" if the picture is missing or broken."""
-    try:
-        with Image.open(path) as picture:
-            check_pixels(path, *picture.size)
-        check_chunks(path)
-    except Exception:  # Pillow's have no common class
-        return ""
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    image = read_png(path)
     if image is None:
         return ""
     scale = LARGEST_SIDE / max(image.shape[:2])
     if scale >= 1:
-        data = path.read_bytes()
+        data = read_bytes(path)
     else:
         small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         data = cv2.imencode(".png", small)[1].tobytes()
