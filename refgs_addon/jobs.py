@@ -503,7 +503,9 @@ def stop_requested(folder: Path) -> bool:
 def _locked(file: Path) -> bool:
     """Check whether a process holds a lock on a file. The system frees the lock when that process ends."""
     try:
-        descriptor = os.open(file, os.O_RDONLY)
+        descriptor = os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))  # a pipe is not waited for
+    except PermissionError:  # another user's
+        return True
     except OSError:  # usually there is no such file
         return False
     try:

@@ -4,6 +4,7 @@ The operating system holds the lock. It releases the lock when the process ends,
 files with its own code, without importing this module.
 """
 
+import errno
 import json
 import time
 from contextlib import suppress
@@ -12,14 +13,17 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from refgs.errors import TryAgain
-from refgs.paths import remove_leftovers, write_text
+from refgs.paths import NO_LOCKS, remove_leftovers, write_text
 
 LOCK, PROGRESS, STOP = "run.lock", "progress.json", "stop"
 EVERY = 1.0  # seconds between looks
 
 
 class RunLock:
-    """Lock a run folder for this process during a `with` block. Raises TryAgain if another process has locked it.
+    """Lock a run folder for this process during a `with` block.
+
+    Raises TryAgain if another process has locked it, or if the lock cannot be opened: it is another user's, or the disk is full. On a file
+    system without locks, nothing is locked.
 
     Half-written files that killed processes left in the folder are removed. A folder that does not exist is made.
     """
@@ -33,8 +37,9 @@ class RunLock:
         except Timeout:
             what = "another process trains it, or makes its mesh: wait until that has ended, or stop it"
             raise TryAgain(f"{self._folder} is in use: {what}") from None
-        except OSError:  # a file system without locks
-            pass
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise self._refused(error) from None
         try:
             self._tidy()
             remove_leftovers(self._folder)
@@ -66,9 +71,17 @@ class RunLock:
             write_text(self._folder / PROGRESS, json.dumps(facts), durable=False)
         return (self._folder / STOP).exists()
 
+    def _refused(self, error: OSError) -> TryAgain:
+        file, again = self._folder / LOCK, "then run the same command again"
+        if file.exists() and error.errno in (errno.EACCES, errno.EPERM):
+            what = f"wait until their training has ended, or delete the file if none runs, {again}"
+            return TryAgain(f"{file} belongs to another user ({error.strerror}): {what}")
+        return TryAgain(f"{file} cannot be written ({error.strerror}): mend that, {again}")
+
     def _release(self) -> None:
-        with suppress(OSError):  # Windows deletes no open file: there filelock deletes it
-            (self._folder / LOCK).unlink()
+        if self._lock.is_locked:  # not on a file system without locks, where it may be another process's
+            with suppress(OSError):  # Windows deletes no open file: there filelock deletes it
+                (self._folder / LOCK).unlink()
         self._lock.release()
 
     def _tidy(self) -> None:

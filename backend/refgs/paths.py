@@ -30,6 +30,8 @@ DISK_ERRORS = tuple(
     )
     if hasattr(errno, name)
 )
+# A file system has no locks. Any other error means that a lock may be held: by another user, say.
+NO_LOCKS = {getattr(errno, name, None) for name in ("ENOLCK", "ENOSYS", "ENOTSUP", "EOPNOTSUPP")}
 _TEMPORARY = re.compile(r"\.refgs-[0-9a-f]{16}\.tmp")
 
 

@@ -128,7 +128,7 @@ def test_a_panorama_is_no_larger_than_its_pixels(tmp_path):
     assert read_environment(path).shape == (2, 4, 3)
     with open(path, "r+b") as file:
         file.truncate(30 << 30)  # without taking room on the disk
-    with pytest.raises(InputError, match="larger than its picture"):
+    with pytest.raises(InputError, match="larger than its 4×2 pixels can be"):
         read_environment(path)
 
 

@@ -37,13 +37,11 @@ def check_photo(path: Path, width: int, height: int) -> None:
     Masks are not checked by this function, because they may be of one colour.
     """
     check_pixels(path, width, height, per_byte=PHOTO_PER_BYTE)
-    with open(path, "rb") as file:
-        if (
-            file.read(2) == b"\xff\xd8" and file.read().count(b"\xff\xda") > MOST_SCANS
-        ):  # start of scan (ITU-T T.81, B.1.1.3)
-            raise InputError(
-                f"{path}: this JPEG has more than {MOST_SCANS} scans, which takes too long to read. Save it anew."
-            )
+    with open_file(path) as file:
+        jpeg = file.read(2) == b"\xff\xd8"
+        if jpeg and file.read().count(b"\xff\xda") > MOST_SCANS:  # start of scan (ITU-T T.81, B.1.1.3)
+            why = f"this JPEG has more than {MOST_SCANS} scans, which takes too long to read"
+            raise InputError(f"{path}: {why}. Save it anew.")
 
 
 def check_chunks(path: Path) -> None:

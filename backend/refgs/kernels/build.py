@@ -20,6 +20,7 @@ import platformdirs
 from filelock import FileLock
 
 from refgs.errors import InputError
+from refgs.paths import NO_LOCKS
 
 HERE = Path(__file__).parent
 WITH_PARENT = str(HERE / "with_parent.py")  # runs a program that ends with this process
@@ -106,12 +107,17 @@ def build(target: Target, cache: Path) -> Path:
 
 @contextmanager
 def _sole_build(cache: Path) -> Iterator[None]:
-    """Wait until no other process builds in `cache`. Remove what killed builds have left there."""
+    """Wait until no other process builds in `cache`. Remove what killed builds have left there.
+
+    Raises OSError if the lock cannot be opened, for `cache` cannot be written, say. On a file system without locks, do not wait.
+    """
     file = cache / "build.lock"
     lock = FileLock(file)
     try:
         lock.acquire()
-    except OSError:  # a file system without locks, or one that cannot be written
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
         yield
         return
     try:
