@@ -305,7 +305,7 @@ def _read_strokes(file: Path, view: View, camera: Camera) -> np.ndarray:
 
     They are undistorted and resized to `camera`, as the photo is.
     """
-    color, alpha = read_image(file)
+    color, alpha = read_image(file, is_data=True)
     height, width = color.shape[:2]
     if abs(width / height * view.camera.height / view.camera.width - 1) > 0.02:
         raise InputError(
