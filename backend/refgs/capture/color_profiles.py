@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from io import BytesIO
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from refgs.capture.reduce import encode
 from refgs.color import REC709, pcs_to_rec709, primaries_to_rec709, srgb_decode, srgb_encode
 from refgs.errors import InputWarning, reason
 
+Found = TypeVar("Found", bound="Profile | LookUp | None")
 Curve = Callable[[np.ndarray], np.ndarray]  # from codes 0..1 to linear values
 
 # White's 16-bit code in photos that may be brighter: 16 steps a step of 8 bits. The largest code is 694 times as bright as white.
@@ -70,7 +72,7 @@ def _power(gamma: float) -> Curve:
 
 # Curves by H.273's code points (table 3). Where a photo's file names a video's curve (1, 6, 14, 15), its codes are taken for those of sRGB,
 # as browsers do. 2 is unspecified.
-_TRANSFERS = {
+_TRANSFERS: dict[int, Curve] = {
     **dict.fromkeys((1, 2, 6, 13, 14, 15), srgb_decode),
     4: _power(2.2),
     5: _power(2.8),
@@ -92,7 +94,7 @@ class Profile:
     With `hdr`, radiance may exceed white's. With `grey`, the profile is for greyscale pictures.
     """
 
-    curves: tuple[Curve, Curve, Curve]
+    curves: tuple[Curve, ...]
     matrix: np.ndarray
     hdr: bool = False
     grey: bool = False
@@ -114,7 +116,10 @@ class Profile:
             part = image[top : top + step]
             linear = cv2.LUT(part, table[None]) if largest == 255 else table[part, (0, 1, 2)]
             if white == 255:  # by a table, because a power takes ten times as long
-                steps = cv2.add(cv2.transform(linear, matrix * 65535), 0, dtype=cv2.CV_16U)  # rounds and clips
+                linear = cv2.transform(linear, matrix * 65535)
+                steps = np.asarray(
+                    cv2.addWeighted(linear, 1, linear, 0, 0, dtype=cv2.CV_16U), np.uint16
+                )  # rounds, clips
                 np.take(_bytes(), steps, out=out[top : top + step], mode="clip")
             else:
                 out[top : top + step] = encode(cv2.transform(linear, matrix), white)
@@ -131,7 +136,7 @@ class LookUp:
     def to_srgb(self, picture: Image.Image) -> Image.Image:
         """Convert a picture of the mode `mode`, or RGBA, to 8-bit sRGB. Alpha stays."""
         out = "RGBA" if picture.mode == "RGBA" else "RGB"
-        return ImageCms.applyTransform(picture, _transform(self, picture.mode, out))
+        return _transform(self, picture.mode, out).apply(picture)
 
 
 def declared_profile(picture: Image.Image, path: Path) -> Profile | LookUp | None:
@@ -139,16 +144,30 @@ def declared_profile(picture: Image.Image, path: Path) -> Profile | LookUp | Non
 
     A profile that cannot be used is ignored with an InputWarning, the first time that it is met.
     """
+    return _usable(lambda: _of_picture(picture, path), path)
+
+
+def coded_profile(primaries: int, transfer: int, path: Path) -> Profile | None:
+    """Return the profile of code points of H.273 in the file `path`. Return None for those of sRGB, and for unknown ones, as above."""
+    return _usable(lambda: _of_code_points(primaries, transfer), path)
+
+
+def _usable(find: Callable[[], Found], path: Path) -> Found | None:
+    """Return what `find` finds. Return None if it is sRGB, or if it cannot be used, of which the first is told."""
     try:
-        if data := picture.info.get("icc_profile"):
-            found = _of_icc(data)
-            _check_mode(found, picture.mode)
-        else:
-            found = _of_tags(picture, path)
-        return None if isinstance(found, Profile) and found.is_srgb else found
+        found = find()
     except Unusable as error:
         _warn_once(str(error), path)
         return None
+    return None if isinstance(found, Profile) and found.is_srgb else found
+
+
+def _of_picture(picture: Image.Image, path: Path) -> Profile | LookUp | None:
+    if not (data := picture.info.get("icc_profile")):
+        return _of_tags(picture, path)
+    found = _of_icc(data)
+    _check_mode(found, picture.mode)
+    return found
 
 
 def _of_tags(picture: Image.Image, path: Path) -> Profile | None:
@@ -356,4 +375,4 @@ def _warn_once(why: str, path: Path) -> None:
     if why not in _told:
         _told.add(why)
         text = f"{path}: its colour profile is ignored: {why}. Save such photos as sRGB if their colours look wrong."
-        warnings.warn(InputWarning(text), stacklevel=3)
+        warnings.warn(InputWarning(text), stacklevel=4)

@@ -71,7 +71,7 @@ class LoadedView:
     @property
     def bytes(self) -> np.ndarray:
         """Return the photo as 8-bit sRGB (H, W, 3), clipped to white."""
-        return _as_bytes(self.image, self.white)
+        return as_bytes(self.image, self.white)
 
     @property
     def clipped(self) -> np.ndarray:
@@ -137,7 +137,7 @@ def read_image(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.n
     naming the file if it is truncated or unreadable.
     """
     image, alpha, white = read_codes(path, shrink, is_data)
-    return _as_bytes(image, white), alpha
+    return as_bytes(image, white), alpha
 
 
 def read_codes(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.ndarray, np.ndarray | None, int]:
@@ -166,7 +166,7 @@ def read_codes(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.n
             pixels = _as_array(_decode(picture, path, look_up), look_up)
         picture.close()  # its pixels take as much memory as their copy
     pixels = np.rot90(pixels, -turns)
-    alpha = np.ascontiguousarray(_as_bytes(pixels[..., 3], white)) if pixels.shape[2] == 4 else None
+    alpha = np.ascontiguousarray(as_bytes(pixels[..., 3], white)) if pixels.shape[2] == 4 else None
     image = np.ascontiguousarray(pixels[..., :3])
     if isinstance(profile, Profile):
         image, white = profile.to_srgb(image)
@@ -362,7 +362,7 @@ def _decode_16_bit(picture: ImageFile.ImageFile, path: Path) -> np.ndarray | Non
     """
     if picture.format == "HEIF" and picture.info["bit_depth"] > 8:
         return _decode_heic(picture, path)
-    tags = picture.tag_v2 if picture.format == "TIFF" else {}
+    tags = getattr(picture, "tag_v2", {})
     deep = set(tags.get(BITSPERSAMPLE, ())) == {16} or (picture.format == "PNG" and ";16" in str(picture.tile))
     if not deep or "transparency" in picture.info:
         return None
@@ -398,7 +398,8 @@ def _decode_heic(picture: ImageFile.ImageFile, path: Path) -> np.ndarray:
     return np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels
 
 
-def _as_bytes(codes: np.ndarray, white: int) -> np.ndarray:
+def as_bytes(codes: np.ndarray, white: int) -> np.ndarray:
+    """Return codes as 8-bit ones, clipped to white."""
     return (
         codes
         if codes.dtype == np.uint8
