@@ -73,7 +73,7 @@ def _pixels(file: Path):
     import numpy as np
 
     image = bpy.data.images.load(str(file))
-    image.colorspace_settings.name = "Non-Color"
+    image.colorspace_settings.is_data = True
     image.alpha_mode = "CHANNEL_PACKED"
     pixels = np.empty(len(image.pixels), np.float32)
     image.pixels.foreach_get(pixels)
@@ -88,7 +88,7 @@ def _write(pixels, png: Path) -> None:
     height, width = pixels.shape[:2]
     image = bpy.data.images.new(png.stem, width, height, alpha=True)
     image.alpha_mode = "CHANNEL_PACKED"
-    image.colorspace_settings.name = "Non-Color"
+    image.colorspace_settings.is_data = True
     image.file_format = "PNG"
     try:
         image.pixels.foreach_set(np.ascontiguousarray(pixels[::-1]).ravel())

@@ -58,7 +58,7 @@ def show_doubt(collection: bpy.types.Collection, on: bool) -> None:
 
 def _add(mesh: bpy.types.Object, file: Path) -> None:
     texture = bpy.data.images.load(str(file))
-    texture.colorspace_settings.name = "Non-Color"
+    texture.colorspace_settings.is_data = True
     texture.pack()
     modifier = mesh.modifiers.new(NAME, "NODES")
     modifier.node_group = doubt_tree()

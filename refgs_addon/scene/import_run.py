@@ -14,6 +14,7 @@ from ..nodes.world_diffuse import add_world_diffuse
 from . import run_parts
 from .camera_objects import add_camera, frame_camera, light_of, read_cameras
 from .capture_cameras import replace_cameras
+from .color_spaces import LINEAR_REC709, set_color_space
 from .place_run import extent
 from .run_toml import capture_of
 from .splat_cloud import add_splats, cloud_attributes, normal_slopes, point_cloud, read_constants, read_splats
@@ -39,6 +40,8 @@ class Run:
     """Cameras by view, the photo's name without its extension."""
     light_of: str = ""
     """View that the world belongs to, if the light turned with the camera. Also in the world's property `refgs_light_of`."""
+    light_is_rec709: bool = True
+    """False if the OpenColorIO config has no linear Rec.709 that is known: then the world's colours are those of another space."""
 
 
 def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
@@ -70,7 +73,9 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
         mesh = add_mesh(folder / "mesh.glb", f"{name} mesh", collection) if (folder / "mesh.glb").exists() else []
         run = Run(collection, add_root(f"RefGS {name}", drawn, mesh), drawn, left_out, mesh)
         if (folder / "environment.exr").exists():
-            run.world = light_with_recovered(scene, f"RefGS {name}", load_panorama(folder / "environment.exr"))
+            light = load_panorama(folder / "environment.exr")
+            run.light_is_rec709 = set_color_space(light, LINEAR_REC709)
+            run.world = light_with_recovered(scene, f"RefGS {name}", light)
             run.light_of = light_of(folder / "cameras.json") if frames else ""
             if run.light_of:
                 run.world["refgs_light_of"] = run.light_of

@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..nodes import add, out, principled
 from ..nodes.splat_material import SPECULAR
 from .atomic_file import unwritable
+from .color_spaces import SRGB, set_color_space
 from .import_run import add_mesh, data_blocks
 
 TEXTURES = "textures"  # folder beside a run's mesh.glb
@@ -83,7 +84,10 @@ def _material(name: str, folder: Path, specular: float) -> bpy.types.Material:
     tree, inputs = node_tree(material), {SPECULAR: specular}
     for picture, socket in _PICTURES.items():
         image = bpy.data.images.load(str(folder / f"{picture}.png"))
-        image.colorspace_settings.name = "sRGB" if picture == "base_color" else "Non-Color"
+        if picture == "base_color":
+            set_color_space(image, SRGB)  # else the config's default for pictures of 8 bits
+        else:
+            image.colorspace_settings.is_data = True
         inputs[socket] = out(add(tree, "ShaderNodeTexImage", image=image))
     inputs["Normal"] = out(add(tree, "ShaderNodeNormalMap", {"Color": inputs["Normal"]}))
     add(tree, "ShaderNodeOutputMaterial", {"Surface": out(add(tree, "ShaderNodeBsdfPrincipled", inputs))})
@@ -97,7 +101,7 @@ def _pack(path: Path, folder: Path, channels: tuple[tuple[str, int], ...]) -> No
     found = []
     for name, channel in channels:
         image = bpy.data.images.load(str(folder / f"{name.removeprefix('-')}.png"))
-        image.colorspace_settings.name = "Non-Color"
+        image.colorspace_settings.is_data = True
         values = np.empty(4 * image.size[0] * image.size[1], np.float32)
         image.pixels.foreach_get(values)
         found.append(1 - values[channel::4] if name.startswith("-") else values[channel::4])

@@ -11,6 +11,7 @@ from .. import compat
 from ..errors import InputError
 from .atomic_file import atomic_write
 from .camera_objects import frame_camera
+from .color_spaces import set_srgb_view
 
 if bpy.app.background:
     # Mesa's software renderer reads far-off texels when it filters anisotropically: pixels of wrong colours, on flat parts, too. Mesa reads
@@ -33,20 +34,20 @@ def render_preview(
 
     `size` is the picture's longer side in pixels; by default the picture is as large as the camera's photo. `samples` are Eevee's. `png`
     gets 8-bit sRGB with straight alpha, through the Standard view transform. `exr` gets linear Rec.709 radiance in 32 bits, premultiplied.
-    The scene's own settings are restored. Raises InputError where there is no camera or a file cannot be written.
+    With an OpenColorIO config that lacks these, `png` is made by the scene's own view, and `exr` has the config's working space. The
+    scene's own settings are restored. Raises InputError where there is no camera or a file cannot be written.
     """
     camera = camera or scene.camera
     if camera is None:
         raise InputError("there is no camera to look through: add one, or import a RefGS run with cameras.json")
     with _restored(scene):
         frame_camera(scene, camera, size)
-        render, view = scene.render, scene.view_settings
+        render = scene.render
         render.engine = engine
         render.film_transparent = True
         render.use_compositing = render.use_sequencer = False
         scene.eevee.taa_render_samples = samples
-        scene.display_settings.display_device = "sRGB"
-        view.view_transform, view.look, view.exposure, view.gamma = "Standard", "None", 0.0, 1.0
+        set_srgb_view(scene)
         bpy.ops.render.render(scene=scene.name)
         picture = bpy.data.images["Render Result"]
         _save(picture, scene, png, "PNG", "8")

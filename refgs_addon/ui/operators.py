@@ -110,6 +110,9 @@ def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, 
     if run.light_of:
         text = f"The light turned with the camera: the world's rotation fits the photo {run.light_of}, and no other"
         operator.report({"WARNING"}, text)
+    if not run.light_is_rec709:
+        text = "This OpenColorIO config has no linear Rec.709 by a known name: set the recovered light's colour space yourself"
+        operator.report({"WARNING"}, text)
     if made_by := newer_release(folder):
         text = f"RefGS {made_by} made this run. This add-on is older and may ignore parts of it: update the add-on"
         operator.report({"WARNING"}, text)

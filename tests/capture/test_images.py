@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import OpenEXR
+import pillow_heif
 import pytest
 import tifffile
 from PIL import ExifTags, Image
@@ -16,7 +17,7 @@ from refgs.camera import Camera
 from refgs.capture import View, load_view, read_capture
 from refgs.capture.check import check
 from refgs.capture.files import find_photos
-from refgs.capture.images import read_focal_length, read_header, read_image, read_mask, write_for_colmap
+from refgs.capture.images import read_codes, read_focal_length, read_header, read_image, read_mask, write_for_colmap
 from refgs.color import srgb_decode
 from refgs.errors import InputError
 from refgs.formats.exr import write_exr
@@ -413,6 +414,57 @@ def test_16_bits_are_kept_in_training(tmp_path, suffix, channels, turns):
     assert np.abs(read_image(path)[0] - colors / 257.0).max() < 1
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("packed", [None, "deflate"])
+def test_tiff_of_every_kind_with_16_bits(tmp_path, order, packed):
+    """Check planes, white at 0, premultiplied alpha and a fourth channel that is no alpha."""
+    values, path = np.random.default_rng(0).integers(0, 65536, (48, 64, 4)).astype(np.uint16), tmp_path / "a.tif"
+    rgb, alpha = values[..., :3], np.rint(values[..., 3] / 257)
+
+    def save(stored, kind, **options):
+        options |= {"byteorder": order, "compression": packed, "metadata": None}
+        tifffile.imwrite(path, np.ascontiguousarray(stored), photometric=kind, **options)
+
+    def planes(stored):
+        return np.moveaxis(stored, -1, 0)
+
+    save(planes(rgb), "rgb", planarconfig="separate")
+    check_codes(path, rgb, 65535)
+    save(planes(np.rot90(rgb)), "rgb", planarconfig="separate", extratags=[(274, "H", 1, 6, False)])
+    check_codes(path, rgb, 65535)
+    save(planes(values), "rgb", planarconfig="separate", extrasamples=[2])
+    check_codes(path, rgb, 65535, alpha)
+    save(values[..., 0], "miniswhite")
+    check_codes(path, 65535 - values[..., [0, 0, 0]], 65535)
+    straight = np.rint(np.minimum(rgb / np.maximum(values[..., 3:], 1) * 65535, 65535))
+    for stored, options in ((values, {}), (planes(values), {"planarconfig": "separate"})):
+        save(stored, "rgb", extrasamples=[1], **options)
+        image, found, _ = read_codes(path)
+        assert np.abs(image - straight).max() <= 1 and np.array_equal(found, alpha)
+    save(values, "rgb", extrasamples=[0])
+    image, found, _ = read_codes(path)
+    assert np.array_equal(image, rgb) and found is None and not read_header(path).has_alpha
+
+
+def test_tiff_with_8_bits_of_other_kinds(tmp_path):
+    """Check white at 0 and premultiplied grey."""
+    values, path = np.random.default_rng(0).integers(0, 256, (48, 64, 2)).astype(np.uint8), tmp_path / "a.tif"
+    tifffile.imwrite(path, values[..., 0], photometric="miniswhite", metadata=None)
+    assert np.array_equal(read_image(path)[0][..., 1], 255 - values[..., 0])
+    options = {"extrasamples": [1], "planarconfig": "contig"}
+    tifffile.imwrite(path, values, photometric="minisblack", metadata=None, **options)
+    image, alpha = read_image(path)
+    straight = np.minimum(values[..., 0] * 255.0 / np.maximum(values[..., 1], 1), 255)
+    assert np.abs(image[..., 2] - straight).max() <= 0.5 and np.array_equal(alpha, values[..., 1])
+
+
+def test_the_first_of_many_pages_is_read(tmp_path):
+    pages = np.random.default_rng(0).integers(0, 65536, (5, 48, 64, 3)).astype(np.uint16)
+    for dtype in (np.uint8, np.uint16):
+        tifffile.imwrite(tmp_path / "a.tif", pages.astype(dtype), photometric="rgb", metadata=None)
+        assert np.array_equal(read_codes(tmp_path / "a.tif")[0], pages[0].astype(dtype))
+
+
 def test_8_bits_stay_8_bits(tmp_path):
     values = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
     for suffix in (".png", ".tif", ".bmp"):
@@ -426,14 +478,21 @@ def test_8_bits_stay_8_bits(tmp_path):
         assert load_view(view, 32).image.dtype == np.uint8
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_truncated_16_bit_photos_are_refused(tmp_path, suffix):
-    path = tmp_path / f"a{suffix}"
-    write(path, np.random.default_rng(0).integers(0, 65536, (48, 64, 3)).astype(np.uint16))
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "planes.tif", "a.heic"])
+def test_truncated_16_bit_photos_are_refused(tmp_path, name):
+    path = tmp_path / name
+    codes = np.random.default_rng(0).integers(0, 65536, (48, 64, 3)).astype(np.uint16)
+    if name == "planes.tif":
+        planes = np.ascontiguousarray(np.moveaxis(codes, -1, 0))
+        tifffile.imwrite(path, planes, photometric="rgb", planarconfig="separate", metadata=None)
+    elif name == "a.heic":
+        pillow_heif.from_bytes(mode="RGB;16", size=(64, 48), data=codes.tobytes()).save(path)
+    else:
+        write(path, codes)
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     view = View(Camera("a", 64, 48, 60, 60, 32, 24, np.eye(4)), path, None, "train", None, False, None)
-    with pytest.raises(InputError, match=f"a{suffix}"):
+    with pytest.raises(InputError, match=name):
         load_view(view)
 
 

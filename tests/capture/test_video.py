@@ -1,12 +1,14 @@
 """Test the choice of photos from videos. The videos are made here, of a window that moves over a texture."""
 
 import struct
+from fractions import Fraction
 from itertools import pairwise
 
 import av
 import cv2
 import numpy as np
 import pytest
+from av.stream import Disposition
 from av.video.reformatter import Colorspace
 from PIL import Image
 
@@ -106,12 +108,20 @@ def test_stretches_in_which_the_camera_stands_are_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("matrix", "turns"),
-    [((0, 1, -1, 0), -1), ((0, -1, 1, 0), 1), ((-1, 0, 0, -1), 2)],
-    ids=["portrait", "portrait upside down", "upside down"],
+    ("matrix", "shown"),
+    [
+        ((0, 1, -1, 0), lambda frame: np.rot90(frame, -1)),
+        ((0, -1, 1, 0), lambda frame: np.rot90(frame, 1)),
+        ((-1, 0, 0, -1), lambda frame: np.rot90(frame, 2)),
+        ((-1, 0, 0, 1), lambda frame: frame[:, ::-1]),
+        ((1, 0, 0, -1), lambda frame: frame[::-1]),
+        ((0, 1, 1, 0), lambda frame: frame.transpose(1, 0, 2)),
+        ((0, -1, -1, 0), lambda frame: np.rot90(frame.transpose(1, 0, 2), 2)),
+    ],
+    ids=["portrait", "portrait upside down", "upside down", "mirrored", "flipped", "transposed", "transversed"],
 )
-def test_photos_are_upright(tmp_path, matrix, turns):
-    """Check the matrix in an MP4's track header (ISO/IEC 14496-12): x' = ax + cy, y' = bx + dy, with y down. `turns` are to the left."""
+def test_photos_are_upright(tmp_path, matrix, shown):
+    """Check the matrix in an MP4's track header (ISO/IEC 14496-12): x' = ax + cy, y' = bx + dy, with y down."""
     write_video(tmp_path / "film.mp4", WALK[:30])
     film = (tmp_path / "film.mp4").read_bytes()
     header = film.index(b"tkhd")
@@ -119,19 +129,108 @@ def test_photos_are_upright(tmp_path, matrix, turns):
     (tmp_path / "film.mp4").write_bytes(film[:place] + track_matrix(*matrix) + film[place + 36 :])
     extract_photos(tmp_path / "film.mp4", tmp_path / "out", 3)
     photo = read_image(find_photos(tmp_path / "out")[0])[0].astype(int)
-    assert min(np.abs(np.rot90(frame, turns) - photo).mean() for frame in WALK[:10]) < 4
+    assert min(np.abs(shown(frame) - photo).mean() for frame in WALK[:10]) < 4
 
 
-def test_hdr_becomes_srgb(tmp_path):
-    """Check that white of HLG, at 75 % of the signal, becomes white of sRGB."""
-    patch = [frame.copy() for frame in WALK]
-    for frame in patch:
-        frame[:40, :40] = round(0.75 * 255)
-    hlg = {"color_trc": 18, "color_primaries": 9, "colorspace": Colorspace.BT2020}
-    write_video(tmp_path / "hdr.mov", patch, "libx265", "yuv420p10le", **hlg)
-    extract_photos(tmp_path / "hdr.mov", tmp_path / "out", STRETCHES)
-    photo = read_image(find_photos(tmp_path / "out")[0])[0]
-    assert photo[5:30, 5:30].min() > 235
+GOLD = np.array([212, 175, 55])
+
+
+def patch(video, out, codes, lines: int = HEIGHT, **options) -> np.ndarray:
+    """Write a film with a patch of 8-bit `codes` over WALK, repeated to at least that many lines. Returns the patch's mean in a photo."""
+    frames = [np.tile(frame, (-(-lines // HEIGHT), 1, 1)) for frame in WALK]
+    for frame in frames:
+        frame[:40, :40] = codes
+    write_video(video, frames, **options)
+    extract_photos(video, out, 3)
+    return read_image(find_photos(out)[0])[0][8:32, 8:32].mean(axis=(0, 1))
+
+
+@pytest.mark.parametrize(
+    ("lines", "options"),
+    [
+        (HEIGHT, {"matrix": Colorspace.ITU601}),
+        (640, {"matrix": Colorspace.ITU709}),
+        (HEIGHT, {"colorspace": Colorspace.ITU709}),
+        (640, {"colorspace": Colorspace.ITU601}),
+        (HEIGHT, {"colorspace": Colorspace.BT2020}),
+        (HEIGHT, {"colorspace": Colorspace.ITU709, "color_range": 2}),
+    ],
+    ids=["untagged, small", "untagged, HD", "BT.709", "HD of BT.601", "BT.2020", "full range"],
+)
+def test_colours_have_the_matrix_of_their_tags_or_size(tmp_path, lines, options):
+    """Check a green, which another matrix or range changes by at least 7 codes. FFmpeg's conversions are off by up to 3."""
+    green = 40, 190, 60
+    found = patch(tmp_path / "film.mp4", tmp_path / "out", green, lines, **options)
+    np.testing.assert_allclose(found, green, atol=4)
+
+
+def test_wide_primaries_become_srgb(tmp_path):
+    """Check Display P3: gold there is (206, 176, 78)."""
+    tags = {"color_primaries": 12, "color_trc": 1, "colorspace": Colorspace.ITU709}
+    found = patch(tmp_path / "film.mp4", tmp_path / "out", (206, 176, 78), **tags)
+    np.testing.assert_allclose(found, GOLD, atol=4.5)
+
+
+@pytest.mark.parametrize(("transfer", "white", "grey"), [(18, 0.75, 0.3783), (16, 0.5807, 0.4109)], ids=["HLG", "PQ"])
+def test_hdr_becomes_srgb(tmp_path, transfer, white, grey):
+    """Check that the white of diffuse surfaces (BT.2408) is white, and what reflects 18 % as much is 0.18 of it: 118 of 255.
+
+    Its code is √(3 · 0.18 · 0.265) for HLG, and for PQ that of 36.5 cd/m².
+    """
+    tags = {"color_trc": transfer, "color_primaries": 9, "colorspace": Colorspace.BT2020}
+    tags |= {"codec": "libx265", "pixels": "yuv420p10le"}
+    for code, expected in ((white, 255), (grey, 118), (0.9, 255)):
+        out = tmp_path / f"{code}"
+        assert np.abs(patch(tmp_path / "hdr.mov", out, round(code * 255), **tags) - expected).max() < 4
+
+
+def test_pixels_become_square(tmp_path):
+    """Check that a pixel's width stretches the photo, in the direction in which no detail is lost."""
+    frames = [window(step) for step in range(LENGTH)]
+    for aspect, size in ((Fraction(4, 3), (HEIGHT, 256)), (Fraction(3, 4), (round(HEIGHT * 4 / 3), WIDTH))):
+        out = tmp_path / f"{size[1]}"
+        write_video(tmp_path / "film.mp4", frames, sample_aspect_ratio=aspect)
+        extract_photos(tmp_path / "film.mp4", out, 3)
+        photo = read_image(find_photos(out)[0])[0]
+        assert photo.shape == (*size, 3)
+        back = cv2.resize(photo, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).astype(int)
+        assert min(np.abs(back - frame).mean() for frame in WALK) < 6
+
+
+def test_interlaced_frames_are_deinterlaced(tmp_path):
+    """Check that a photo of two woven fields, between which the camera moved by 8 pixels, has no comb."""
+
+    def comb(picture: np.ndarray) -> float:
+        grey = picture.astype(float).mean(axis=2)
+        return float(np.abs(grey[1:-1] - (grey[:-2] + grey[2:]) / 2).mean())
+
+    woven = [frame.copy() for frame in WALK[2:]]
+    for frame, later in zip(woven, WALK[4:] + WALK[:2], strict=True):
+        frame[1::2] = later[1::2]
+    write_video(tmp_path / "film.mp4", woven, x264="tff=1")
+    found = extract_photos(tmp_path / "film.mp4", tmp_path / "out", 5)
+    assert found["frames"] == len(woven)
+    for photo in find_photos(tmp_path / "out"):
+        assert comb(read_image(photo)[0]) < 1.2 * comb(WALK[0]) < 0.65 * comb(woven[0])
+
+
+@pytest.mark.parametrize("name", ["film.mkv", "film.webm"])
+def test_a_film_whose_header_has_no_length(tmp_path, name):
+    """Check a film as programs write it that stream it while they record: into a pipe, so that the header cannot be completed."""
+    codec = {"codec": "libvpx-vp9"} if name.endswith("webm") else {}
+    write_video(tmp_path / name, WALK, options={"live": "1"}, **codec)
+    with av.open(str(tmp_path / name)) as container:
+        assert not container.duration and not container.streams.video[0].duration
+    found = extract_photos(tmp_path / name, tmp_path / "out", STRETCHES)
+    assert found == {"frames": LENGTH, "photos": STRETCHES, "blurred": 0, "duplicates": 0}
+
+
+def test_a_name_with_a_colon(tmp_path, monkeypatch):
+    """Check that FFmpeg does not take what is before the colon for a protocol."""
+    monkeypatch.chdir(tmp_path)
+    write_video(tmp_path / "film.mp4", WALK)
+    (tmp_path / "film.mp4").rename(tmp_path / "12:30.mp4")
+    assert extract_photos("12:30.mp4", "out", 5)["photos"] == 5
 
 
 def test_a_large_video_is_kept_in_full_size(tmp_path):
@@ -189,6 +288,16 @@ def test_what_is_no_video(tmp_path):
         container.mux(stream.encode(sound))
         container.mux(stream.encode())
     refused("there is no film in it", tmp_path / "sound.m4a", tmp_path / "out")
+    with av.open(str(tmp_path / "song.mp4"), "w") as container:
+        cover = container.add_stream("mjpeg", rate=1)
+        cover.width, cover.height, cover.pix_fmt = WIDTH, HEIGHT, "yuvj420p"
+        cover.disposition = Disposition.attached_pic
+        stream = container.add_stream("aac", rate=44100, layout="mono")
+        container.mux(cover.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(WALK[0]), format="rgb24")))
+        container.mux(stream.encode(sound))
+        for each in (cover, stream):
+            container.mux(each.encode())
+    refused("there is no film in it", tmp_path / "song.mp4", tmp_path / "out")
 
 
 def test_a_truncated_video(tmp_path):

@@ -59,6 +59,39 @@ def test_of_several_parts_the_first_in_colour_is_read(tmp_path):
         read_exr(tmp_path / "depth.exr")
 
 
+def test_colours_of_other_primaries_become_rec709(tmp_path):
+    """Check ACEScg against the matrix that ACES publishes, and that data stays as it is."""
+    cg = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
+    matrix = np.array([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]])
+    pixels = RNG.random((9, 7, 4)).astype(np.float32) * 10
+
+    def write(**header) -> None:
+        header |= {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+        OpenEXR.File(header, {"RGBA": pixels}).write(str(tmp_path / "a.exr"))
+
+    write(chromaticities=cg)
+    found = read_exr(tmp_path / "a.exr")
+    np.testing.assert_allclose(found[..., :3], pixels[..., :3] @ matrix.T, atol=3e-4)
+    np.testing.assert_array_equal(found[..., 3], pixels[..., 3])
+    np.testing.assert_array_equal(read_exr(tmp_path / "a.exr", is_data=True), pixels)
+    write()
+    np.testing.assert_array_equal(read_exr(tmp_path / "a.exr"), pixels)
+    write(chromaticities=(0.3,) * 8)
+    with pytest.raises(InputError, match="chromaticities span no colours"):
+        read_exr(tmp_path / "a.exr")
+
+
+def test_deep_files_are_refused(tmp_path):
+    samples = np.empty((2, 2), object)
+    for number in range(4):
+        samples.flat[number] = np.ones(number + 1, np.float32)
+    header = {"type": OpenEXR.deepscanline, "compression": OpenEXR.ZIPS_COMPRESSION}
+    OpenEXR.File(header, dict.fromkeys("RGB", samples)).write(str(tmp_path / "a.exr"))
+    for read in (read_exr, read_exr_header):
+        with pytest.raises(InputError, match=r"a\.exr is a deep EXR: save it flattened"):
+            read(tmp_path / "a.exr")
+
+
 def test_bad_files_are_named(tmp_path):
     with pytest.raises(InputError, match="missing"):
         read_exr(tmp_path / "none.exr")

@@ -9,18 +9,27 @@ from scipy.ndimage import map_coordinates
 from tests.makers.captures import CENTRE, ball_normals, ring
 
 
-def write_video(path, frames, codec="libx264", pixels="yuv420p", options=None, **color) -> None:
-    """Write frames (H, W, 3) uint8 as a video of 30 frames a second. `color` are properties of the codec, such as color_trc."""
+def write_video(
+    path, frames, codec="libx264", pixels="yuv420p", options=None, matrix=None, x264="", **properties
+) -> None:
+    """Write frames (H, W, 3) uint8 as a video of 30 frames a second. `properties` are the codec's, such as color_trc.
+
+    `matrix` is that from RGB to YUV, by default the one that `properties` name as `colorspace`; `x264` are the encoder's parameters.
+    """
     with av.open(str(path), "w", options=options or {}) as container:
-        options = {"crf": "12", "preset": "ultrafast", "x265-params": "log-level=none"}
+        options = {"crf": "12", "preset": "ultrafast", "x265-params": "log-level=none", "x264-params": x264}
         stream = container.add_stream(codec, rate=30, options=options)
         stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt = pixels
-        for name, value in color.items():
+        for name, value in properties.items():
             setattr(stream.codec_context, name, value)
         for number, picture in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-            frame = frame.reformat(format=pixels, dst_colorspace=color.get("colorspace"))
+            frame = frame.reformat(
+                format=pixels,
+                dst_colorspace=matrix or properties.get("colorspace"),
+                dst_color_range=properties.get("color_range"),
+            )
             frame.pts = number
             container.mux(stream.encode(frame))
         container.mux(stream.encode())

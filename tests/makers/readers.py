@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import tifffile
 from PIL import Image
-from pillow_heif import register_heif_opener
+from pillow_heif import from_bytes, register_heif_opener
 from plyfile import PlyData, PlyElement
 
 from benchmarks.scenes.analytic import write_ball_capture
@@ -58,11 +59,14 @@ from tests.makers.captures import ring
 from tests.makers.dng import write_dng
 from tests.makers.films import film_ball
 from tests.makers.models import write_model
+from tests.makers.profiles import DISPLAY_P3, gamma, matrix_profile, table_profile
 from tests.makers.splats import make
 from tests.makers.training import TINY, trained, trainer
 
 CAMERA = Camera("a", 16, 12, 15.0, 15.0, 8.0, 6.0, np.linalg.inv(ring(1)[0] @ captures.FLIP))
 PHOTO = np.random.default_rng(0).integers(0, 255, (12, 16, 3), np.uint8)
+P3 = matrix_profile(DISPLAY_P3, gamma(2.2))
+TABLES = table_profile(b"RGB ", 3, lambda corner: (sum(corner) * 33, 0, 0))
 
 
 class Reader(NamedTuple):
@@ -102,6 +106,15 @@ def _photo(suffix: str, write: Callable[[Path], object] | None = None, share: fl
 def _pillow(image: np.ndarray, **options) -> Callable[[Path], None]:
     register_heif_opener()
     return lambda file: Image.fromarray(image).save(file, **options)
+
+
+def _planes(file: Path) -> None:
+    planes = np.ascontiguousarray(np.moveaxis(PHOTO.astype(np.uint16) * 257, -1, 0))
+    tifffile.imwrite(file, planes, photometric="rgb", planarconfig="separate", metadata=None)
+
+
+def _ten_bits(file: Path) -> None:
+    from_bytes(mode="RGB;16", size=(16, 12), data=(PHOTO.astype(np.uint16) * 257).tobytes()).save(file)
 
 
 def _view(folder: Path, **fields) -> View:
@@ -326,9 +339,14 @@ READERS: dict[str, Reader] = {
     "JPEG": _photo(".jpg", lambda file: captures.write_as_phone(file, PHOTO, 1, 24), share=2),
     "TIFF": _photo(".tif", share=2),
     "TIFF, 16 bits": _photo(".tif", lambda file: captures.write(file, PHOTO.astype(np.uint16) * 257)),
+    "TIFF in planes": _photo(".tif", _planes, 0.5),
+    "PNG with a profile": _photo(".png", _pillow(PHOTO, icc_profile=P3)),
+    "PNG with a profile of tables": _photo(".png", _pillow(PHOTO, icc_profile=TABLES), 0.5),
     "WebP": _photo(".webp"),
     "BMP": _photo(".bmp"),
     "HEIC": _photo(".heic", lambda file: captures.write_as_phone(file, PHOTO, 1, 24), 0.5),
+    "HEIC, 10 bits": _photo(".heic", _ten_bits, 0.5),
+    "AVIF": _photo(".avif", _pillow(PHOTO), 0.5),
     "DNG": _photo(".dng", lambda file: write_dng(file, np.full((32, 48, 3), 0.3), turns=1, film=24), 0.5),
     "EXR": _photo(".exr", lambda file: write_exr(file, PHOTO / 255), 2),
     "a mask": Reader(

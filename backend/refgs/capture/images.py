@@ -1,10 +1,13 @@
 """Load photos and masks for training: decode, undistort and reduce them. The results are sRGB codes with straight alpha.
 
-Photos with 8 bits a channel are loaded as 8-bit codes. Photos with more bits (PNG and TIFF with 16, camera RAW, EXR) are loaded as 16-bit
-codes. In an EXR, codes above that of white stand for brighter radiance.
+Colours are those that the file declares: see `refgs.capture.color_profiles`. Photos with 8 bits a channel are loaded as 8-bit codes. Photos
+with more bits (PNG and TIFF with 16, HEIC with 10, camera RAW, EXR) are loaded as 16-bit codes. In EXR and HDR photos, codes above that of
+white stand for brighter radiance.
 """
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -12,11 +15,14 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import tifffile
 from PIL import ExifTags, Image, ImageFile
-from pillow_heif import register_heif_opener
+from PIL.TiffImagePlugin import BITSPERSAMPLE, EXTRASAMPLES, OPEN_INFO, PHOTOMETRIC_INTERPRETATION, PLANAR_CONFIGURATION
+from pillow_heif import open_heif, register_heif_opener
 
 from refgs.camera import Camera
 from refgs.capture import raw
+from refgs.capture.color_profiles import HDR_WHITE, LookUp, Profile, declared_profile
 from refgs.capture.reduce import encode, reduced
 from refgs.capture.types import View
 from refgs.errors import InputError, reason
@@ -25,6 +31,8 @@ from refgs.formats.pixels import check_chunks, check_photo, check_pixels, decode
 from refgs.memory import is_shortage
 
 register_heif_opener()  # Pillow opens HEIC then
+# It lacks big-endian greyscale TIFF with 16 bits in which 0 is white. `_decode_16_bit` inverts what it reads.
+OPEN_INFO[b"MM", 0, (1,), 1, (16,), ()] = ("I;16B", "I;16B")
 Image.MAX_IMAGE_PIXELS = None  # `check_pixels` has the limit
 
 # The JPEG decoder leaves a photo at least this many times as large as wanted. It averages encoded values, which darkens highlights: at 2,
@@ -53,10 +61,6 @@ ROWS = 128  # that are copied from a decoded picture at a time
 # sees a mirrored world.
 _TURNS = {6: 1, 3: 2, 8: 3}
 
-EXR_WHITE = (
-    4080  # white's 16-bit code in an EXR: 16 steps a step of 8 bits. The largest code is 694 times as bright as white.
-)
-
 
 @dataclass(frozen=True, eq=False)
 class LoadedView:
@@ -80,7 +84,7 @@ class LoadedView:
     @property
     def bytes(self) -> np.ndarray:
         """Return the photo as 8-bit sRGB (H, W, 3), clipped to white."""
-        return _as_bytes(self.image, self.white)
+        return as_bytes(self.image, self.white)
 
     @property
     def clipped(self) -> np.ndarray:
@@ -137,18 +141,19 @@ def read_focal_length(path: Path) -> float | None:
         return None
 
 
-def read_image(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | None]:
+def read_image(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
     """Decode an image file to RGB (H, W, 3) uint8 and alpha (H, W) uint8, None without alpha.
 
     The image is turned upright by its EXIF orientation. Greyscale files and those with more than 8 bits are converted to 8-bit RGB.
     `shrink` may be 2, 4 or 8: a JPEG's sides are divided by it. If it does not divide them evenly, it is halved until it does. A RAW
-    photo's sides are halved at most. Raises InputError naming the file if it is truncated or unreadable.
+    photo's sides are halved at most. Colours are converted to sRGB by the file's profile. With `is_data`, as for normals, codes stay as
+    stored. Raises InputError naming the file if it is truncated or unreadable.
     """
-    image, alpha, white = read_codes(path, shrink)
-    return _as_bytes(image, white), alpha
+    image, alpha, white = read_codes(path, shrink, is_data)
+    return as_bytes(image, white), alpha
 
 
-def read_codes(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | None, int]:
+def read_codes(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.ndarray, np.ndarray | None, int]:
     """Decode an image file to RGB codes (H, W, 3), alpha (H, W) uint8 or None, and the code of white.
 
     Codes are uint8 or uint16, as in the file. The arguments and errors are those of `read_image`.
@@ -159,22 +164,28 @@ def read_codes(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | No
         np.take(_encoding_table(), linear, out=linear, mode="clip")  # the other modes make a copy
         return np.ascontiguousarray(np.rot90(linear, -turns)), None, raw.WHITE
     if _is_exr(path):
-        return *_exr_codes(path), EXR_WHITE
+        return *_exr_codes(path), HDR_WHITE
     with _open(path) as picture:
-        check_photo(path, *picture.size)
+        if not is_data:
+            check_photo(path, *picture.size)
         turns = _turns(picture)
-        pixels = _decode_16_bit(picture, path)
+        profile = None if is_data else declared_profile(picture, path)
+        look_up = profile if isinstance(profile, LookUp) else None
+        pixels = None if look_up else _decode_16_bit(picture, path)
         white = 255 if pixels is None else 65535
         if pixels is None:
             width, height = picture.size
             shrink = _divisor(shrink, width, height)
             if picture.format in ("JPEG", "MPO"):
                 picture.draft(picture.mode, (width // shrink, height // shrink))
-            pixels = _as_array(_decode(picture, path))
+            pixels = _as_array(_decode(picture, path, look_up), look_up)
         picture.close()  # its pixels take as much memory as their copy
     pixels = np.rot90(pixels, -turns)
-    alpha = np.ascontiguousarray(_as_bytes(pixels[..., 3], white)) if pixels.shape[2] == 4 else None
-    return np.ascontiguousarray(pixels[..., :3]), alpha, white
+    alpha = np.ascontiguousarray(as_bytes(pixels[..., 3], white)) if pixels.shape[2] == 4 else None
+    image = np.ascontiguousarray(pixels[..., :3])
+    if isinstance(profile, Profile):
+        image, white = profile.to_srgb(image)
+    return image, alpha, white
 
 
 def _exr_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -183,10 +194,10 @@ def _exr_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, axis=2)
     if pixels.shape[2] == 3:
-        return encode(pixels, EXR_WHITE), None
+        return encode(pixels, HDR_WHITE), None
     alpha = np.clip(pixels[..., 3:], 0, 1)  # premultiplied
     image = np.where(alpha > 0, pixels[..., :3] / np.maximum(alpha, 1e-6), 0)
-    return encode(image, EXR_WHITE), np.rint(alpha[..., 0] * 255).astype(np.uint8)
+    return encode(image, HDR_WHITE), np.rint(alpha[..., 0] * 255).astype(np.uint8)
 
 
 def write_for_colmap(path: Path, out: Path) -> bool:
@@ -216,17 +227,17 @@ def read_mask(path: Path, below: float | None = None) -> np.ndarray:
     `below` times the largest possible value.
     """
     if below is not None:
-        return np.where(read_image(path)[0][..., 0] < 255 * below, np.uint8(255), np.uint8(0))
+        return np.where(read_image(path, is_data=True)[0][..., 0] < 255 * below, np.uint8(255), np.uint8(0))
     values, white = _labels(path), 255
     if values is None:
-        image, alpha, white = read_codes(path)
+        image, alpha, white = read_codes(path, is_data=True)
         values = image.max(axis=2)
         if alpha is not None and alpha.min() < 255:
             values, white = alpha, 255
     low, high = values.min(), values.max()
     if np.all((values == low) | (values == high)):
         return np.where(values > (low if low < high else 0), np.uint8(255), np.uint8(0))
-    return _as_bytes(values, white)
+    return as_bytes(values, white)
 
 
 def _labels(path: Path) -> np.ndarray | None:
@@ -264,7 +275,7 @@ def read_alpha(view: View) -> np.ndarray | None:
     the upright photo is therefore turned as the photo's EXIF says.
     """
     if view.mask_path is None:
-        return read_image(view.image_path)[1] if view.has_alpha else None
+        return read_image(view.image_path, is_data=True)[1] if view.has_alpha else None
     return _file_mask(view, view.mask_path)
 
 
@@ -346,17 +357,11 @@ def _turns(picture: Image.Image) -> int:
         return 0
 
 
-def _decode(picture: Image.Image, path: Path) -> Image.Image:
-    """Decode a picture to 8-bit RGB or RGBA. Pillow is used, because OpenCV does not detect a truncated file."""
+@contextmanager
+def _decoding(path: Path) -> Iterator[None]:
+    """Turn a decoder's errors into an InputError that names the file."""
     try:
-        if picture.mode.startswith("I;16"):
-            values = np.asarray(picture, dtype=np.float64) / 257
-            picture = Image.fromarray(np.rint(values).astype(np.uint8))
-        elif picture.mode in ("I", "F"):
-            raise InputError(f"{path}: the image holds 32-bit numbers; save it as EXR, or as 16-bit PNG, sRGB-encoded.")
-        mode = "RGBA" if picture.has_transparency_data else "RGB"
-        picture.load()
-        return picture if picture.mode == mode else picture.convert(mode)
+        yield
     except InputError:
         raise
     except Exception as error:
@@ -365,34 +370,86 @@ def _decode(picture: Image.Image, path: Path) -> Image.Image:
         raise InputError(f"{path}: the image is truncated or broken ({reason(error)}). Replace it.") from error
 
 
-def _as_array(picture: Image.Image) -> np.ndarray:
-    """Copy a picture to an array (H, W, C) uint8, strip by strip: Pillow makes one more copy of all that it converts at once."""
-    pixels = np.empty((picture.height, picture.width, len(picture.getbands())), np.uint8)
+def _decode(picture: Image.Image, path: Path, look_up: LookUp | None = None) -> Image.Image:
+    """Decode a picture to 8-bit RGB or RGBA, or to CMYK if `look_up` is for it.
+
+    Pillow is used, because OpenCV does not detect a truncated file.
+    """
+    with _decoding(path):
+        if picture.mode.startswith("I;16"):
+            values = np.asarray(picture, dtype=np.float64) / 257
+            picture = Image.fromarray(np.rint(values).astype(np.uint8))
+        elif picture.mode in ("I", "F"):
+            raise InputError(f"{path}: the image holds 32-bit numbers; save it as EXR, or as 16-bit PNG, sRGB-encoded.")
+        mode = look_up.mode if look_up else "RGB"
+        mode = "RGBA" if picture.has_transparency_data and mode == "RGB" else mode
+        picture.load()
+        if picture.mode == "La":  # premultiplied grey, of which Pillow makes no RGBA
+            grey, alpha = picture.split()
+            divided = np.asarray(grey) * 255.0 / np.maximum(np.asarray(alpha), 1)
+            picture = Image.merge("LA", [Image.fromarray(np.rint(np.minimum(divided, 255)).astype(np.uint8)), alpha])
+        return picture if picture.mode == mode else picture.convert(mode)
+
+
+def _as_array(picture: Image.Image, look_up: LookUp | None) -> np.ndarray:
+    """Copy a picture to an array (H, W, 3 | 4) uint8, converted by `look_up`.
+
+    It is copied in strips, because Pillow copies once more what it returns.
+    """
+    pixels = np.empty((picture.height, picture.width, 4 if picture.mode == "RGBA" else 3), np.uint8)
     for top in range(0, picture.height, ROWS):
         bottom = min(top + ROWS, picture.height)
-        pixels[top:bottom] = np.asarray(picture.crop((0, top, picture.width, bottom)))
+        strip = picture.crop((0, top, picture.width, bottom))
+        pixels[top:bottom] = np.asarray(look_up.to_srgb(strip) if look_up else strip)
     return pixels
 
 
 def _decode_16_bit(picture: ImageFile.ImageFile, path: Path) -> np.ndarray | None:
-    """Decode a PNG or TIFF with 16 bits a channel to RGB or RGBA uint16 (H, W, 3 | 4). Return None for other pictures.
+    """Decode a PNG or TIFF with 16 bits a channel, or a HEIC with more than 8, to RGB or RGBA uint16 (H, W, 3 | 4).
 
-    OpenCV decodes the colours, because Pillow keeps only their upper 8 bits. Pillow first checks that the file is not truncated, which
-    OpenCV does not.
+    Return None for other pictures. OpenCV decodes the colours of PNG and TIFF, because Pillow keeps only their upper 8 bits. Pillow first
+    checks that the file is not truncated, which OpenCV does not.
     """
-    if picture.format not in ("PNG", "TIFF") or ";16" not in str(picture.tile) or "transparency" in picture.info:
+    if picture.format == "HEIF" and picture.info["bit_depth"] > 8:
+        return _decode_heic(picture, path)
+    tags = getattr(picture, "tag_v2", {})
+    deep = set(tags.get(BITSPERSAMPLE, ())) == {16} or (picture.format == "PNG" and ";16" in str(picture.tile))
+    if not deep or "transparency" in picture.info:
         return None
-    size = picture.size
-    _decode(picture, path)
-    check_chunks(path)
-    pixels = decode(path, cv2.IMREAD_UNCHANGED)
+    size, bands, associated = picture.size, len(picture.getbands()), tags.get(EXTRASAMPLES, (0,))[0] == 1
+    if tags.get(PLANAR_CONFIGURATION) == 2:  # a plane a channel: neither of the two decodes it right
+        with _decoding(path):
+            pixels = np.moveaxis(tifffile.imread(path, key=0), 0, -1)
+        pixels = np.rot90(pixels, -_TURNS.get(tags.get(ExifTags.Base.Orientation, 1), 0))
+    else:
+        _decode(picture, path)
+        check_chunks(path)
+        pixels = decode(path, cv2.IMREAD_UNCHANGED)
+        if pixels is not None:
+            order = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
+            pixels = cv2.cvtColor(pixels, order[pixels.ndim if pixels.ndim == 2 else pixels.shape[2]])
     if pixels is None or pixels.dtype != np.uint16 or pixels.shape[1::-1] != size:
         return None
-    channels = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
-    return cv2.cvtColor(pixels, channels[pixels.ndim if pixels.ndim == 2 else pixels.shape[2]])
+    if tags.get(PHOTOMETRIC_INTERPRETATION) == 0:  # 0 is white
+        np.subtract(65535, pixels, out=pixels)
+    pixels = pixels[..., : max(bands, 3)]  # more are no alpha
+    if associated and bands == 4:  # premultiplied
+        alpha = np.maximum(pixels[..., 3:], 1).astype(np.float32)
+        pixels[..., :3] = np.rint(np.minimum(pixels[..., :3] / alpha, 1) * 65535)
+    return pixels
 
 
-def _as_bytes(codes: np.ndarray, white: int) -> np.ndarray:
+def _decode_heic(picture: ImageFile.ImageFile, path: Path) -> np.ndarray:
+    """Decode a HEIC with more than 8 bits a channel, as `_decode_16_bit` does."""
+    with _decoding(path):
+        heic = open_heif(path, convert_hdr_to_8bit=False, hdr_to_16bit=False)
+        largest = (1 << picture.info["bit_depth"]) - 1
+        pixels = np.take(np.rint(np.arange(largest + 1) * (65535 / largest)).astype(np.uint16), np.asarray(heic))
+    return np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels
+
+
+def as_bytes(codes: np.ndarray, white: int) -> np.ndarray:
+    """Return codes as 8-bit ones, clipped to white."""
     return (
         codes
         if codes.dtype == np.uint8

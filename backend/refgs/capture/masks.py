@@ -310,7 +310,7 @@ def _read_strokes(file: Path, view: View, camera: Camera) -> np.ndarray:
     The strokes are undistorted and resized to `camera`, like the photo. Raises InputError if they lack transparency, or if their shape is
     not the photo's.
     """
-    color, alpha = read_image(file)
+    color, alpha = read_image(file, is_data=True)
     height, width = color.shape[:2]
     if abs(width / height * view.camera.height / view.camera.width - 1) > 0.02:
         raise InputError(

@@ -127,10 +127,10 @@ def _read(path: Path, channels: int) -> np.ndarray:
     if path.suffix.lower() in (".npy", ".npz"):
         values = _read_array(path, channels)
     elif path.suffix.lower() == ".exr":
-        values = read_exr(path)
+        values = read_exr(path, is_data=True)
         values = values[..., :3] if values.ndim == 3 else values[..., None]
     else:
-        codes, alpha, white = read_codes(path)
+        codes, alpha, white = read_codes(path, is_data=True)
         values = codes.astype(np.float32) / white
         if alpha is not None:
             values[alpha < 128] = 0

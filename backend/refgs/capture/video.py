@@ -1,5 +1,6 @@
 """Choose photos from a video: the sharpest frame of each stretch of time, where the camera moved."""
 
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -7,13 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import av
+import av.filter
 import cv2
 import numpy as np
 from av.container import InputContainer
 from av.error import FFmpegError
-from av.video.reformatter import ColorPrimaries, ColorTrc, VideoReformatter
+from av.stream import Disposition
+from av.video.reformatter import Colorspace, ColorTrc, VideoReformatter
+from av.video.stream import VideoStream
 from PIL import Image
 
+from refgs.capture.color_profiles import coded_profile
+from refgs.capture.images import as_bytes
 from refgs.errors import InputError
 from refgs.paths import disk_errors_named
 
@@ -26,7 +32,27 @@ MOVED = 0.005  # part of the picture's longer side. Between neighbours of 100 ph
 MIN_PHOTOS = 3  # `find_cameras` needs as many
 WHOLE = 0.95  # part of the length in the header that must be there, else the file is truncated; the last frame may stay for long
 HDR = (ColorTrc.ARIB_STD_B67, ColorTrc.SMPTE2084)  # HLG and PQ
+UNTAGGED = 2  # H.273's code point of an unspecified matrix
+SD_LINES = (
+    576  # a film with more lines that names no matrix has that of BT.709, as players assume; others that of BT.601
+)
+ASPECTS = 0.1, 10.0  # of a pixel; others are errors of the file
 REFILM = "Film for 20 to 60 seconds, walking slowly around the object"
+
+
+@dataclass(eq=False)
+class _Film:
+    """Hold an opened video: its stream of frames, its length in seconds, and a pixel's width divided by its height.
+
+    `matrix` is the part of the display matrix (a, b, c, d) by which players turn and mirror frames: x' = ax + cy, y' = bx + dy, y down.
+    """
+
+    file: Path
+    container: InputContainer
+    stream: VideoStream
+    length: float
+    aspect: float
+    matrix: tuple[int, int, int, int] = (1, 0, 0, 1)
 
 
 @dataclass(eq=False)
@@ -44,8 +70,9 @@ def extract_photos(
     """Choose up to `count` frames of a video and write them to `out`/images as JPEG files frame_0001.jpg, frame_0002.jpg …
 
     The video's time is divided into `count` equal stretches. The sharpest frame of each stretch is taken. It is left out if it is much less
-    sharp than the frames of the neighbouring stretches, or if the camera has not moved since the last photo. Photos are upright, as players
-    show the video. HDR is converted to sRGB.
+    sharp than the frames of the neighbouring stretches, or if the camera has not moved since the last photo. Photos are turned and mirrored
+    as players show the video, with square pixels; interlaced frames are deinterlaced. Colours are converted to sRGB as the video declares
+    them. Of HDR (HLG, PQ), the white of diffuse surfaces becomes white, and what is brighter is clipped.
 
     Memory holds one frame in full size, and a small grey picture for each stretch. `report("progress", facts)` is called after each frame.
     `done` and `total` count frames. `kept` and `blurred` count the stretches so far. Returns the counts `frames`, `photos`, `blurred` and
@@ -61,7 +88,8 @@ def extract_photos(
     if not video.is_file():
         raise InputError(f"{video}: there is no such file. Name a video, such as .mp4 or .mov.")
     new = not out.exists()
-    with _opened(video) as container:
+    film = _opened(video)
+    with film.container:
         try:
             out.mkdir(parents=True, exist_ok=True)
             shutil.rmtree(work, ignore_errors=True)
@@ -70,7 +98,7 @@ def extract_photos(
             raise InputError(f"{out}: no folder can be made there ({error.strerror}). Name another one.") from error
         try:
             with disk_errors_named([work], "run the command again"):
-                frames, candidates = _sharpest(video, container, work, count, report)
+                frames, candidates = _sharpest(film, work, count, report)
                 kept, blurred, duplicates = _choose(video, frames, candidates)
                 for number, candidate in enumerate(kept, 1):
                     candidate.file.rename(work / f"frame_{number:04d}.jpg")
@@ -135,38 +163,54 @@ def _products(*pictures: np.ndarray) -> np.ndarray:
     return np.array([[np.vdot(one, other) for other in pictures] for one in pictures], np.float64)
 
 
-def _opened(video: Path) -> InputContainer:
+def _opened(video: Path) -> _Film:
     """Open a video file. Raise InputError if it is not a video, or if its header is missing because it is truncated."""
+    path = os.path.abspath(video)  # FFmpeg takes what is before a colon for a protocol, but not in a path from the root
     try:
-        container = av.open(str(video), metadata_errors="replace")
+        container = av.open(path, metadata_errors="replace")
+        # A song's or a film's cover is a stream, too.
+        streams = [each for each in container.streams.video if not each.disposition & Disposition.attached_pic]
+        length = _length(container, streams[0]) if streams else 0.0
+        if streams and length <= 0:  # as programs write it that stream while they record
+            with av.open(path, metadata_errors="replace") as again:
+                length = _scanned_length(again, streams[0].index)
     except (FFmpegError, OSError) as error:
         why = error.strerror or type(error).__name__
         raise InputError(
             f"{video}: this is not a video that can be read ({why}). Copy it from the phone again, or save it as MP4."
         ) from error
-    if not container.streams.video or _length(container) <= 0:
+    if length <= 0:
         container.close()
         raise InputError(f"{video}: there is no film in it. Name a video, such as .mp4 or .mov.")
-    return container
+    aspect = float(streams[0].sample_aspect_ratio or 1)
+    return _Film(video, container, streams[0], length, aspect if ASPECTS[0] < aspect < ASPECTS[1] else 1.0)
 
 
-def _length(container: InputContainer) -> float:
+def _length(container: InputContainer, stream: VideoStream) -> float:
     """Return the length of a video in seconds, 0 if the file does not say it."""
-    stream = container.streams.video[0]
     if stream.duration and stream.time_base:
         return float(stream.duration * stream.time_base)
     return (container.duration or 0) / av.time_base
 
 
-def _frames(video: Path, container: InputContainer) -> Iterator[tuple[float, av.VideoFrame]]:
+def _scanned_length(container: InputContainer, stream: int) -> float:
+    """Return the length of a stream in seconds by the times of all its packets. Return 0 if there are fewer than two."""
+    times = [
+        (float(packet.pts * packet.time_base), float((packet.duration or 0) * packet.time_base))
+        for packet in container.demux(container.streams[stream])
+        if packet.pts is not None
+    ]
+    return max(start + long for start, long in times) - min(times)[0] if len(times) > 1 else 0.0
+
+
+def _frames(film: _Film) -> Iterator[tuple[float, av.VideoFrame]]:
     """Decode a video. Yield each frame with its time in seconds, from 0. Raise InputError where it is broken or truncated."""
-    stream = container.streams.video[0]
+    video, stream, length = film.file, film.stream, film.length
     stream.thread_type = "AUTO"
-    length = _length(container)
     start, time, step = None, 0.0, float(1 / stream.average_rate) if stream.average_rate else 0.0
     again = "Copy it from the phone again, or save it as MP4."
     try:
-        for frame in container.decode(stream):
+        for frame in _deinterlaced(film):
             if frame.time is None:
                 continue
             start = frame.time if start is None else start
@@ -181,38 +225,80 @@ def _frames(video: Path, container: InputContainer) -> Iterator[tuple[float, av.
         raise InputError(f"{video}: it is truncated, {time:.1f} of {length:.1f} seconds are there. {again}")
 
 
-def _sharpest(
-    video: Path, container: InputContainer, work: Path, count: int, report: Callable
-) -> tuple[int, list[_Candidate]]:
+def _deinterlaced(film: _Film) -> Iterator[av.VideoFrame]:
+    """Decode a video. From the first interlaced frame on, interlaced frames are deinterlaced (FFmpeg's bwdif)."""
+    graph = None
+    for number, frame in enumerate(film.container.decode(film.stream)):
+        if number == 0:
+            film.matrix = _display_matrix(frame)
+        if graph is None and frame.interlaced_frame:
+            graph = av.filter.Graph()
+            graph.link_nodes(
+                graph.add_buffer(template=film.stream),
+                graph.add("bwdif", "mode=send_frame:deint=interlaced"),
+                graph.add("buffersink"),
+            ).configure()
+        if graph is None:
+            yield frame
+        else:
+            graph.push(frame)
+            yield from _pulled(graph)
+    if graph is not None:
+        graph.push(None)
+        yield from _pulled(graph)
+
+
+def _pulled(graph: av.filter.Graph) -> Iterator[av.VideoFrame]:
+    """Yield the frames that a graph of filters has ready."""
+    while True:
+        try:
+            yield graph.vpull()
+        except (BlockingIOError, EOFError):
+            return
+
+
+def _display_matrix(frame: av.VideoFrame) -> tuple[int, int, int, int]:
+    """Return a frame's display matrix without its shift, rounded to quarter turns: see `_Film`."""
+    data = frame.side_data.get("DISPLAYMATRIX")
+    if data is None:
+        return 1, 0, 0, 1
+    a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].astype(int)
+    sideways = abs(b) + abs(c) > abs(a) + abs(d)
+    one, other = (b, c) if sideways else (a, d)
+    one, other = (-1 if one < 0 else 1), (-1 if other < 0 else 1)
+    return (0, one, other, 0) if sideways else (one, 0, 0, other)
+
+
+def _sharpest(film: _Film, work: Path, count: int, report: Callable) -> tuple[int, list[_Candidate]]:
     """Find the sharpest frame of each of `count` stretches, and write it to the folder `work`. Stretches without frames are skipped.
 
     Returns how many frames were read, and the candidates in the order of time.
     """
-    length = _length(container)
-    rate = float(container.streams.video[0].average_rate or 0)
+    length = film.length
+    rate = float(film.stream.average_rate or 0)
     frames, candidates = 0, []
     current, best, most = -1, None, 0.0
     so_far = {"kept": 0, "blurred": 0}  # the neighbours to come may change them
-    # Each converter keeps its tables. Those for HDR take seconds to compute.
+    # Each converter keeps its tables.
     to_grey, to_color = VideoReformatter(), VideoReformatter()
 
     def write(measured: float, grey: np.ndarray, frame: av.VideoFrame) -> None:
         file = work / f"stretch_{current:05d}.jpg"
-        Image.fromarray(_upright(frame, to_color)).save(file, quality=95, subsampling=0)
+        Image.fromarray(_upright(film, frame, to_color)).save(file, quality=95, subsampling=0)
         scale = min(1.0, FLOW_SIDE / max(grey.shape))
         size = [max(1, round(side * scale)) for side in grey.shape[::-1]]
         candidates.append(_Candidate(measured, cv2.resize(grey, size, interpolation=cv2.INTER_AREA), file))
         so_far["kept"] = len(_sharp(candidates))
         so_far["blurred"] = len(candidates) - so_far["kept"]
 
-    for time, frame in _frames(video, container):
+    for time, frame in _frames(film):
         place = time / length * count
         stretch = min(int(place), count - 1)
         if stretch != current:
             if best is not None:
                 write(*best)
             current, best = stretch, None
-        grey = _grey(frame, to_grey)
+        grey = _grey(film, frame, to_grey)
         measured = sharpness(grey)
         value = measured * (1 - OFF_CENTRE * abs(2 * (place - stretch) - 1))
         if best is None or value > most:
@@ -257,16 +343,34 @@ def _choose(video: Path, frames: int, candidates: list[_Candidate]) -> tuple[lis
     return kept, len(candidates) - len(sharp), len(sharp) - len(kept)
 
 
-def _grey(frame: av.VideoFrame, converter: VideoReformatter) -> np.ndarray:
+def _grey(film: _Film, frame: av.VideoFrame, converter: VideoReformatter) -> np.ndarray:
     """Return a frame as a grey picture (h, w) uint8, reduced to SIDE pixels on its longer side."""
-    scale = min(1.0, SIDE / max(frame.width, frame.height))
-    width, height = (max(1, round(side * scale)) for side in (frame.width, frame.height))
+    size = _square(film, frame)
+    scale = min(1.0, SIDE / max(size))
+    width, height = (max(1, round(side * scale)) for side in size)
     return converter.reformat(frame, width, height, "gray", interpolation="AREA").to_ndarray()
 
 
-def _upright(frame: av.VideoFrame, converter: VideoReformatter) -> np.ndarray:
-    """Return a frame in full size as RGB (H, W, 3) uint8, sRGB-encoded and turned as its metadata says."""
-    turns = round(frame.rotation / 90)  # counter-clockwise; phones film portrait as landscape with a rotation
-    hdr = {"dst_color_trc": ColorTrc.IEC61966_2_1, "dst_color_primaries": ColorPrimaries.BT709}
-    picture = converter.reformat(frame, format="rgb24", **(hdr if frame.color_trc in HDR else {}))
-    return np.ascontiguousarray(np.rot90(picture.to_ndarray(), turns))
+def _square(film: _Film, frame: av.VideoFrame) -> tuple[int, int]:
+    """Return the width and height of a frame with square pixels. Neither is smaller than the frame's."""
+    return round(frame.width * max(film.aspect, 1)), round(frame.height * max(1 / film.aspect, 1))
+
+
+def _upright(film: _Film, frame: av.VideoFrame, converter: VideoReformatter) -> np.ndarray:
+    """Return a frame in full size as RGB (H, W, 3) uint8, sRGB-encoded, with square pixels, turned and mirrored as its metadata says."""
+    # Players take the curves of other transfers for that of the screen, and so do we.
+    transfer = frame.color_trc if frame.color_trc in HDR else ColorTrc.BT709
+    profile = coded_profile(frame.color_primaries, transfer, film.file)
+    picture = converter.reformat(
+        frame,
+        *_square(film, frame),
+        "rgb24" if profile is None else "rgb48le",
+        src_colorspace=Colorspace.ITU709 if frame.colorspace == UNTAGGED and frame.height > SD_LINES else None,
+        interpolation=None if film.aspect == 1 else "BICUBIC",
+    ).to_ndarray()
+    if profile is not None:
+        picture = as_bytes(*profile.to_srgb(picture))
+    a, b, c, d = film.matrix
+    if a == 0:
+        picture, a, d = picture.transpose(1, 0, 2), c, b
+    return np.ascontiguousarray(picture[::d, ::a])

@@ -58,7 +58,7 @@ class TensoIRTruth(GroundTruth):
     def _pixels(self, name: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Read a picture of a view as float32 in 0..1, and its alpha, 1 if it has none."""
         file = self.folder / camera.name / f"{name}.png"
-        pixels, alpha = read_image(file)
+        pixels, alpha = read_image(file, is_data=True)
         check_size(file, pixels, camera)
         alpha = np.full(pixels.shape[:2], 255, np.uint8) if alpha is None else alpha
         return pixels.astype(np.float32) / 255, alpha.astype(np.float32) / 255

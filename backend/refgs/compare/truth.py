@@ -77,7 +77,7 @@ class GroundTruth:
 
     def _read(self, name: str, camera: Camera) -> np.ndarray:
         file = self.folder / name / f"{camera.name}.exr"
-        pixels = read_exr(file)
+        pixels = read_exr(file, is_data=name != "albedo")
         check_size(file, pixels, camera)
         channels = {"normal": 3, "albedo": 3}.get(name, 1)
         if pixels.ndim == 2 and channels > 1:

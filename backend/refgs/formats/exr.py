@@ -2,17 +2,16 @@
 
 import errno
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 
+from refgs.color import REC709, primaries_to_rec709
 from refgs.errors import InputError
 from refgs.formats.pixels import check_pixels
 from refgs.paths import whole
-
-# Chromaticities x, y of Rec.709 / sRGB: red, green, blue, D65 white (ITU-R BT.709-6, table 1).
-_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 
 # A larger picture than a panorama of 8192×4096, with so many pixels a byte, is taken for a broken one: deflate packs 1032 bytes into one.
 _FEWEST = 40_000_000, 1032
@@ -28,7 +27,7 @@ def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
-        "chromaticities": _REC709,
+        "chromaticities": REC709,
     }
     with whole(path) as temporary:
         try:
@@ -54,6 +53,9 @@ def read_exr_header(path: str | os.PathLike) -> tuple[int, int, bool]:
             names = [{channel.name for channel in header["channels"]} for header in headers]
             part = next((i for i, found in enumerate(names) if set("RGB") <= found), 0)
             data, display = (np.array(headers[part][name]) for name in ("dataWindow", "displayWindow"))
+            _check_flat(path, headers)
+    except InputError:
+        raise
     except Exception:
         raise _broken(path) from None
     if not np.array_equal(data, display):
@@ -63,8 +65,10 @@ def read_exr_header(path: str | os.PathLike) -> tuple[int, int, bool]:
     return width, height, "A" in names[part]
 
 
-def read_exr(path: str | os.PathLike) -> np.ndarray:
+def read_exr(path: str | os.PathLike, is_data: bool = False) -> np.ndarray:
     """Read an EXR file as float32: (H, W, 4) for RGBA, (H, W, 3) for RGB, or (H, W) for a single channel.
+
+    Colours are linear Rec.709: they are converted from the file's chromaticities. With `is_data`, as for normals, they stay as stored.
 
     If the file has several parts, the first part with R, G and B is read. If no part has them, the first part is read. Raises InputError if
     that part has several channels, or if the file is missing or broken.
@@ -74,14 +78,17 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
         raise InputError(f"{path} is missing")
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
-            windows = [np.array(part.header["dataWindow"]) for part in file.parts]
+            headers = [dict(part.header) for part in file.parts]  # closing the file empties them
+            windows = [np.array(header["dataWindow"]) for header in headers]
+            _check_flat(path, headers)
         for low, high in windows:  # every part is decoded
             width, height = (high - low + 1).tolist()
             check_pixels(path, width, height, *_FEWEST)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             parts = [file.channels(i) for i in range(len(file.parts))]
-            part = next((part for part in parts if {"R", "G", "B"} <= part.keys()), parts[0])
-            channels = {name: channel.pixels for name, channel in part.items()}
+            number = next((i for i, part in enumerate(parts) if {"R", "G", "B"} <= part.keys()), 0)
+            channels = {name: channel.pixels for name, channel in parts[number].items()}
+            primaries = headers[number].get("chromaticities", REC709)
     except (InputError, MemoryError):
         raise
     except Exception:  # the binding raises RuntimeError, ValueError or its own errors
@@ -89,12 +96,32 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
     if {"R", "G", "B"} <= channels.keys():
         names = [name for name in "RGBA" if name in channels]
         # No second copy: a panorama of 8192×4096 takes 400 MB.
-        return np.stack([channels[name] for name in names], axis=-1, dtype=np.float32, casting="unsafe")
+        pixels = np.stack([channels[name] for name in names], axis=-1, dtype=np.float32, casting="unsafe")
+        return pixels if is_data else _as_rec709(path, pixels, primaries)
     if len(channels) == 1:
         return next(iter(channels.values())).astype(np.float32)
     raise InputError(
         f"{path} has the channels {', '.join(sorted(channels))}: save it as plain RGB, RGBA or one channel"
     )
+
+
+def _as_rec709(path: Path, pixels: np.ndarray, primaries: Sequence[float]) -> np.ndarray:
+    """Convert linear pixels (H, W, 3 | 4), in place, from these chromaticities. Colours beyond Rec.709 become negative."""
+    if np.allclose(primaries, REC709, atol=1e-3):
+        return pixels
+    try:
+        matrix = primaries_to_rec709(primaries).astype(np.float32)
+    except ValueError:
+        raise InputError(f"{path}: its chromaticities span no colours. Save it as linear Rec.709.") from None
+    for row in pixels:
+        row[:, :3] = row[:, :3] @ matrix.T
+    return pixels
+
+
+def _check_flat(path: Path, headers: list[dict]) -> None:
+    """Raise InputError if a file is deep: it has a list of numbers a pixel."""
+    if any(header["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile) for header in headers):
+        raise InputError(f"{path} is a deep EXR: save it flattened, with one value a pixel")
 
 
 def _broken(path: Path) -> InputError:
