@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from refgs.paths import ROOT
-from tests.makers import fuzz
+from tests.makers import fuzz, specials
 from tests.makers.readers import READERS
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory is limited and measured as Linux does")
@@ -100,3 +100,17 @@ def test_any_json_is_read_or_refused_in_one_line(samples, name, value, key):
             assert fuzz.verdict(reader, folder) is None, data
     finally:
         file.write_bytes(sample)
+
+
+@pytest.mark.timeout(1800)
+def test_pipes_devices_and_holes_are_refused_in_one_line(tmp_path):
+    """Put what is no ordinary file, and a file with a hole of 30 GB, in the place of every kind of file.
+
+    No reader may wait for a pipe, nor take more than 1 GB.
+    """
+    names = [name for name in READERS if name not in specials.READ_BY_THE_TEST]
+    command = [sys.executable, "-c", "from tests.makers.specials import run; run()", str(tmp_path), *names]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    found = [json.loads(line) for line in (tmp_path / "found.jsonl").read_text().splitlines()]
+    assert len(found) == len(names) * len(specials.KINDS)
+    assert [facts for facts in found if facts["said"] or facts["bytes"] > fuzz.MOST] == []

@@ -17,7 +17,9 @@ from typing import BinaryIO
 
 from refgs.errors import InputError, TryAgain
 
-LARGEST = 64 << 20  # bytes of a text file; Python takes up to 20 times as much memory for what it holds
+LARGEST = (
+    64 << 20
+)  # bytes of a text file, or of another that is read as a whole; Python takes up to 20 times as much memory for what it holds
 PACKAGE = Path(__file__).resolve().parent
 ROOT = PACKAGE.parents[1]
 PRESETS = PACKAGE / "presets" if (PACKAGE / "presets").is_dir() else ROOT / "presets"  # in a wheel, in a clone
@@ -150,13 +152,16 @@ def hash_file(file: Path, kind: Callable = hashlib.blake2b) -> "hashlib._Hash":
     Raises OSError if the file cannot be read, or if it is a folder, a pipe or a device.
     """
     with open_file(file) as opened:
-        return hashlib.file_digest(opened, kind)
+        return hashlib.file_digest(opened, kind)  # pyright: ignore[reportArgumentType]  # its stub lacks BinaryIO
 
 
 def read_bytes(file: Path) -> bytes:
-    """Read a file. Raises OSError if it cannot be read, or if it is a folder, a pipe or a device."""
+    """Read a file. Raises OSError if it cannot be read, is a folder, a pipe or a device, or has more than LARGEST bytes."""
     with open_file(file) as opened:
-        return opened.read()
+        data = opened.read(LARGEST + 1)
+    if len(data) > LARGEST:
+        raise OSError(errno.EINVAL, "larger than such a file can be", str(file))
+    return data
 
 
 @contextmanager
@@ -214,6 +219,11 @@ def command_line(*words: object) -> str:
     """Return a command for the user to type: words are quoted where the shell needs it."""
     join = subprocess.list2cmdline if sys.platform == "win32" else shlex.join
     return join([str(word) for word in words])
+
+
+def clone_environment() -> dict[str, str]:
+    """Return the environment for a Python that is to import modules from its current folder, the root of the repository."""
+    return os.environ | {"PYTHONSAFEPATH": ""}
 
 
 def clone_root() -> Path:

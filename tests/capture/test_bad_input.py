@@ -3,13 +3,14 @@
 import json
 import os
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from refgs.capture import load_view, published_normals, read_cameras, read_capture
+from refgs.capture import load_normals, load_view, published_normals, read_cameras, read_capture
 from refgs.capture.stanford_orb import novel_views
 from refgs.errors import InputError, one_line
 from tests.makers.captures import (
@@ -233,6 +234,46 @@ def test_points_without_coordinates(tmp_path):
     (folder / "points.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n")
     edit(folder / "transforms.json", lambda data: data.update(ply_file_path="points.ply"))
     refused(lambda: read_capture(folder), "points.ply", "no points with x, y and z", "ply_file_path")
+
+
+@pytest.mark.parametrize("name", ["/proc/kcore", "/proc/self/pagemap", "../points.ply", "a/../../points.ply"])
+def test_points_outside_of_the_capture_are_not_read(tmp_path, name):
+    folder = nerfstudio(tmp_path / "capture", 4)
+    (tmp_path / "points.ply").write_bytes(b"ply")
+    edit(folder / "transforms.json", lambda data: data.update(ply_file_path=name))
+    refused(
+        lambda: read_capture(folder), "points.ply" if "points" in name else name, "ply_file_path names a file outside"
+    )
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs pipes")
+@pytest.mark.parametrize("which", ["mask", "photo", "points", "normals"])
+def test_pipes_in_a_capture_are_refused_or_not_found(tmp_path, which):
+    """Check that nobody waits for a pipe to be written. The test's time limit ends it otherwise."""
+    folder = nerfstudio(tmp_path / "capture", 5)
+    photo = sorted((folder / "images").iterdir())[0]
+    place = {
+        "mask": folder / "masks" / f"{photo.stem}.png",
+        "photo": photo,
+        "points": folder / "points.ply",
+        "normals": folder / "normals" / f"{photo.stem}.npy",
+    }[which]
+    place.parent.mkdir(exist_ok=True)
+    place.unlink(missing_ok=True)
+    os.mkfifo(place)
+    if which == "points":
+        edit(folder / "transforms.json", lambda data: data.update(ply_file_path="points.ply"))
+
+    def read():
+        capture = read_capture(folder)
+        for view in capture.views:
+            load_normals(replace(view, prior_normals=place if which == "normals" else None))
+
+    if which in ("mask", "photo"):  # as if it were not there
+        capture = read_capture(folder)
+        assert [view.mask_path for view in capture.views] == [None] * (4 if which == "photo" else 5)
+    else:
+        refused(read, place.name, "not a file" if which == "points" else "not an array of NumPy")
 
 
 def test_some_photos_named_absolutely(tmp_path, monkeypatch):

@@ -1,5 +1,8 @@
 import io
+import json
+import struct
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -127,3 +130,33 @@ def test_a_file_that_reaches_beyond_itself_is_refused(tmp_path, edit):
     rewrite_glb(tmp_path / "mesh.glb", edit)
     with pytest.raises(InputError, match="is not a whole binary glTF file of a mesh"):
         read_glb(tmp_path / "mesh.glb")
+
+
+@pytest.mark.parametrize(
+    "uri", ["/etc/passwd", "../secret.bin", "beside.bin", "file:///etc/passwd", "https://example.org/a.bin"]
+)
+def test_a_glb_that_names_another_file_is_refused(tmp_path, monkeypatch, uri):
+    """Check that a buffer's URI opens no file, wherever that is."""
+    (tmp_path / "beside.bin").write_bytes(bytes(4096))
+    tree = {
+        "asset": {"version": "2.0"},
+        "buffers": [{"uri": uri, "byteLength": 36}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "nodes": [{"mesh": 0}],
+        "scenes": [{"nodes": [0]}],
+        "scene": 0,
+    }
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    chunk = struct.pack("<I4s", len(text), b"JSON") + text
+    file = tmp_path / "a.glb"
+    file.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunk)) + chunk)
+    opened, known = [], open
+    monkeypatch.setattr(
+        "builtins.open", lambda name, *more, **others: (opened.append(name), known(name, *more, **others))[1]
+    )
+    with pytest.raises(InputError, match=r"a\.glb is not a whole binary glTF file"):
+        read_glb(file)
+    assert not [name for name in opened if isinstance(name, str | Path) and Path(name) != file]

@@ -1,20 +1,24 @@
 """Test that pictures are refused by the size that they declare, before they are decoded, and that large photos are not."""
 
+import os
 import shutil
 import struct
+import subprocess
 import sys
 import zlib
+from contextlib import nullcontext
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from refgs.capture.images import read_codes, read_header, read_image, read_mask
+from refgs.capture.images import read_codes, read_header, read_image, read_mask, write_for_colmap
 from refgs.errors import InputError
 from refgs.formats.exr import read_exr, write_exr
 from refgs.formats.panorama import read_environment
-from refgs.formats.pixels import decode, read_png
+from refgs.formats.pixels import DEEP_PHOTO, MOST_OF_PHOTO, PHOTO, check_pixels, decode, read_png
+from refgs.paths import ROOT
 from tests.makers import fuzz
 from tests.makers.captures import write, write_as_phone
 
@@ -102,26 +106,6 @@ def test_a_chunk_that_is_longer_than_its_file_takes_no_memory(tmp_path):
     assert fuzz.memory("VmHWM") - before < 100 << 20
 
 
-def test_a_photo_of_little_that_takes_gigabytes_is_refused(tmp_path):
-    """Check a PNG of one colour: as a photo it is refused, and as a grey mask, which is one, it is read."""
-    Image.new("RGB", (10_500, 10_500)).save(tmp_path / "photo.png")
-    assert read_header(tmp_path / "photo.png")[:2] == (10_500, 10_500)
-    with pytest.raises(InputError, match="do not fit into so small a file"):
-        read_codes(tmp_path / "photo.png")
-
-
-def test_a_jpeg_of_a_thousand_scans_is_refused(tmp_path):
-    """Check a progressive JPEG whose last scan is repeated: every decoder takes the time of a picture for each."""
-    path = tmp_path / "a.jpg"
-    Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)).save(path, progressive=True)
-    data = path.read_bytes()
-    scan = data[data.rindex(b"\xff\xda") : data.rindex(b"\xff\xd9")]
-    assert read_image(path)[0].shape == (64, 64, 3)
-    path.write_bytes(data[:-2] + 1000 * scan + data[-2:])
-    with pytest.raises(InputError, match="more than 100 scans"):
-        read_image(path)
-
-
 def test_a_panorama_is_no_larger_than_its_pixels(tmp_path):
     path = tmp_path / "light.hdr"
     path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 4\n" + bytes(32))
@@ -140,13 +124,13 @@ def test_opencv_is_given_no_other_kinds_than_png_tiff_and_radiance(tmp_path, mon
     Image.new("RGB", (16, 8), "red").save(tmp_path / "a.jp2")
     for name in ("a.hdr", "a.png", "a.tif"):
         shutil.copy(tmp_path / "a.jp2", tmp_path / name)
-        assert decode(tmp_path / name, cv2.IMREAD_UNCHANGED) is None
+        assert decode(tmp_path / name, cv2.IMREAD_UNCHANGED, 16, 8) is None
     assert read_png(tmp_path / "a.png") is None
     with pytest.raises(InputError, match=r"a\.hdr: this is not a Radiance picture"):
         read_environment(tmp_path / "a.hdr")
     assert given == []
     write(tmp_path / "b.png", np.full((8, 16, 3), 7, np.uint16))
-    assert decode(tmp_path / "b.png", cv2.IMREAD_UNCHANGED).max() == 7 and given == [b"\x89PNG"]
+    assert decode(tmp_path / "b.png", cv2.IMREAD_UNCHANGED, 16, 8).max() == 7 and given == [b"\x89PNG"]
 
 
 def test_only_pngs_of_runs_are_shown(tmp_path):
@@ -155,3 +139,81 @@ def test_only_pngs_of_runs_are_shown(tmp_path):
     write(tmp_path / "c.png", np.full((8, 16, 3), 7, np.uint8))
     assert read_png(tmp_path / "b.png") is None and read_png(tmp_path / "gone.png") is None
     assert read_png(tmp_path / "c.png").shape == (8, 16, 3)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is measured as Linux does")
+def test_a_small_file_does_not_take_gigabytes(tmp_path):
+    """Check a PNG of 254 million pixels in about a megabyte: deflate packs as many of one colour."""
+    path = tmp_path / "a.png"
+    Image.new("RGB", (15_900, 16), "red").save(path)
+    data = path.read_bytes()
+    header = data[12:16] + struct.pack(">II", 15_900, 16_000) + data[24:29]
+    path.write_bytes(data[:12] + header + zlib.crc32(header).to_bytes(4, "big") + data[33:] + bytes(1_100_000))
+    fuzz.forget_peak()
+    before = fuzz.memory("VmRSS")
+    with pytest.raises(InputError, match=r"15900×16000 pixels do not fit into so small a file"):
+        read_codes(path)
+    assert fuzz.memory("VmHWM") - before < 100 << 20
+
+
+@pytest.mark.parametrize(
+    ("size", "bits", "bytes_", "read"),
+    [
+        ((14_204, 10_652), 8, 10_000_000, True),  # a medium-format camera's, well compressed
+        ((14_204, 10_652), 16, 10_000_000, True),
+        ((16_320, 12_240), 8, 10_000_000, True),  # a phone's
+        ((14_204, 10_652), 8, 1_000_000, False),
+        ((14_204, 10_652), 16, 1_000_000, False),
+        ((12_000, 9_000), 16, 1_000_000, False),
+    ],
+)
+def test_photos_as_large_as_cameras_take(tmp_path, size, bits, bytes_, read):
+    path = tmp_path / "a.png"
+    path.touch()
+    os.truncate(path, bytes_)
+    limits = (PHOTO if bits == 8 else DEEP_PHOTO), MOST_OF_PHOTO
+    with nullcontext() if read else pytest.raises(InputError, match="do not fit into so small a file"):
+        check_pixels(path, *size, *limits)
+
+
+def jpeg_of_scans(path, scans):
+    """Write a progressive JPEG, and repeat its last scan until there are so many."""
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64), np.uint8)).save(path, progressive=True)
+    data = path.read_bytes()
+    last = data.rindex(b"\xff\xda")
+    comment = b"\xff\xfe\x00\x04\xff\xd9"  # has the letters of the end
+    path.write_bytes(data[:-2] + (comment + data[last:-2]) * (scans - data.count(b"\xff\xda")) + b"\xff\xd9")
+
+
+def test_jpegs_of_many_scans_are_refused(tmp_path):
+    jpeg_of_scans(tmp_path / "few.jpg", 100)
+    jpeg_of_scans(tmp_path / "many.jpg", 101)
+    assert read_image(tmp_path / "few.jpg")[0].shape == (64, 64, 3)
+    with pytest.raises(InputError, match=r"many\.jpg: the JPEG has more than 100 scans"):
+        read_image(tmp_path / "many.jpg")
+    with pytest.raises(InputError, match=r"many\.jpg: the JPEG has more than 100 scans"):
+        write_for_colmap(tmp_path / "many.jpg", tmp_path / "out.jpg")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is measured as Linux does")
+@pytest.mark.parametrize(("mode", "size"), [("L", (16_000, 15_900)), ("RGB", (14_204, 9_000))])
+def test_the_largest_pictures_of_small_files_are_decoded_in_a_gigabyte(tmp_path, mode, size):
+    """Check a mask of 254 million pixels, and a photo of a little less than PHOTO, each of one colour."""
+    code = f"""
+import sys
+from pathlib import Path
+from PIL import Image
+from refgs.capture.images import read_codes, read_mask
+from refgs.paths import ROOT
+from tests.makers import fuzz
+path = Path({str(tmp_path)!r}) / "a.png"
+Image.new({mode!r}, {size}, "white").save(path, compress_level=1)
+fuzz.forget_peak()
+before = fuzz.memory("VmRSS")
+found = read_mask(path) if {mode!r} == "L" else read_codes(path)[0]
+assert found.shape[1::-1] == {size} and found[-1, -1].min() == 255
+print(fuzz.memory("VmHWM") - before)
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) < fuzz.MOST

@@ -18,7 +18,7 @@ from refgs.camera import Camera
 from refgs.capture.images import LoadedView, load_view
 from refgs.capture.reduce import reduced
 from refgs.capture.types import View
-from refgs.paths import whole
+from refgs.paths import check_file, whole
 
 LARGE = 500e6  # bytes of all photos of a capture, from which on they are cached
 
@@ -102,6 +102,7 @@ def _read(camera: Camera, folder: Path, name: str) -> LoadedView | None:
 
 def _mapped(file: Path, shape: tuple[int, ...], *kinds: type) -> np.ndarray:
     """Map an array from a file. Raises an exception of any type if the file is damaged, or has another shape, or a dtype not in `kinds`."""
+    check_file(file)
     values = np.asarray(np.load(file, mmap_mode="c"))  # not "r", as torch warns of arrays that it must not write
     if values.shape != shape or values.dtype not in kinds:
         raise ValueError("another array")

@@ -27,7 +27,16 @@ from refgs.capture.reduce import encode, reduced
 from refgs.capture.types import View
 from refgs.errors import InputError, reason
 from refgs.formats.exr import read_exr, read_exr_header
-from refgs.formats.pixels import check_chunks, check_photo, check_pixels, decode
+from refgs.formats.pixels import (
+    DEEP_PHOTO,
+    MOST_OF_PHOTO,
+    PHOTO,
+    check_chunks,
+    check_length,
+    check_pixels,
+    check_scans,
+    decode,
+)
 from refgs.memory import is_shortage
 
 register_heif_opener()  # Pillow opens HEIC then
@@ -166,8 +175,6 @@ def read_codes(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.n
     if _is_exr(path):
         return *_exr_codes(path), HDR_WHITE
     with _open(path) as picture:
-        if not is_data:
-            check_photo(path, *picture.size)
         turns = _turns(picture)
         profile = None if is_data else declared_profile(picture, path)
         look_up = profile if isinstance(profile, LookUp) else None
@@ -177,6 +184,7 @@ def read_codes(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.n
             width, height = picture.size
             shrink = _divisor(shrink, width, height)
             if picture.format in ("JPEG", "MPO"):
+                check_scans(path, width, height)
                 picture.draft(picture.mode, (width // shrink, height // shrink))
             pixels = _as_array(_decode(picture, path, look_up), look_up)
         picture.close()  # its pixels take as much memory as their copy
@@ -212,6 +220,8 @@ def write_for_colmap(path: Path, out: Path) -> bool:
         return True
     with _open(path) as picture:
         turned = picture.format == "TIFF" and Image.Image.getexif(picture).get(ExifTags.Base.Orientation, 1) != 1
+        if picture.format in ("JPEG", "MPO"):
+            check_scans(path, *picture.size)
         if picture.format in ("JPEG", "MPO", "PNG", "TIFF", "BMP") and not turned:
             return False
         _decode(picture, path).convert("RGB").save(out, "JPEG", quality=95, subsampling=0)
@@ -228,27 +238,28 @@ def read_mask(path: Path, below: float | None = None) -> np.ndarray:
     """
     if below is not None:
         return np.where(read_image(path, is_data=True)[0][..., 0] < 255 * below, np.uint8(255), np.uint8(0))
-    values, white = _labels(path), 255
+    values, white = _stored_numbers(path), 255
     if values is None:
         image, alpha, white = read_codes(path, is_data=True)
         values = image.max(axis=2)
         if alpha is not None and alpha.min() < 255:
             values, white = alpha, 255
     low, high = values.min(), values.max()
-    if np.all((values == low) | (values == high)):
+    if np.count_nonzero(values == low) + np.count_nonzero(values == high) >= values.size:
         return np.where(values > (low if low < high else 0), np.uint8(255), np.uint8(0))
     return as_bytes(values, white)
 
 
-def _labels(path: Path) -> np.ndarray | None:
-    """Read numbers (H, W) that are no brightness, upright: True where a coloured palette's index is an object, or two 32-bit numbers.
+def _stored_numbers(path: Path) -> np.ndarray | None:
+    """Read the numbers (H, W) that a mask's file stores, upright, without decoding them as colours.
 
-    Return None if the image has none. Programs that segment photos write such files.
+    These are the codes of a black-and-white or grey picture, two 32-bit numbers, or True where a coloured palette's index is an object.
+    Programs that segment photos write such files. Return None for other pictures.
     """
     if _is_raw(path) or _is_exr(path):
         return None
     with _open(path) as picture:
-        if picture.mode not in ("P", "I", "F") or picture.has_transparency_data:
+        if picture.mode not in ("1", "L", "P", "I", "F") or picture.has_transparency_data:
             return None
         try:
             values = np.rot90(np.asarray(picture), -_turns(picture))
@@ -256,6 +267,8 @@ def _labels(path: Path) -> np.ndarray | None:
             if is_shortage(error):
                 raise
             raise InputError(f"{path}: the image is truncated or broken ({reason(error)}). Replace it.") from error
+        if picture.mode in ("1", "L"):
+            return values
         if picture.mode != "P":
             return values if np.isfinite(values).all() and len(np.unique(values)) <= 2 else None
         colors = np.zeros((256, 3), np.uint8)
@@ -335,6 +348,7 @@ def _divisor(shrink: int, width: int, height: int) -> int:
 
 def _open(path: Path) -> ImageFile.ImageFile:
     try:
+        check_length(path)
         picture = Image.open(path, formats=tuple(FORMATS))
     except FileNotFoundError:
         raise InputError(f"{path}: the image is missing. Put it back, or remove it from the capture.") from None
@@ -342,7 +356,10 @@ def _open(path: Path) -> ImageFile.ImageFile:
         if is_shortage(error):
             raise
         raise InputError(f"{path}: this is not an image that can be read ({reason(error)}). Replace it.") from error
-    check_pixels(path, *picture.size)
+    if picture.mode in ("1", "L"):
+        check_pixels(path, *picture.size)
+    else:
+        check_pixels(path, *picture.size, PHOTO, MOST_OF_PHOTO)
     return picture
 
 
@@ -371,9 +388,10 @@ def _decoding(path: Path) -> Iterator[None]:
 
 
 def _decode(picture: Image.Image, path: Path, look_up: LookUp | None = None) -> Image.Image:
-    """Decode a picture to 8-bit RGB or RGBA, or to CMYK if `look_up` is for it.
+    """Decode a picture to 8-bit RGB, RGBA or grey, or to CMYK if `look_up` is for it.
 
-    Pillow is used, because OpenCV does not detect a truncated file.
+    Pillow is used, because OpenCV does not detect a truncated file. Black and white stay one byte a pixel: a mask of 256 million pixels
+    would take 2 GB in colour.
     """
     with _decoding(path):
         if picture.mode.startswith("I;16"):
@@ -388,7 +406,8 @@ def _decode(picture: Image.Image, path: Path, look_up: LookUp | None = None) -> 
             grey, alpha = picture.split()
             divided = np.asarray(grey) * 255.0 / np.maximum(np.asarray(alpha), 1)
             picture = Image.merge("LA", [Image.fromarray(np.rint(np.minimum(divided, 255)).astype(np.uint8)), alpha])
-        return picture if picture.mode == mode else picture.convert(mode)
+        kept = picture.mode == mode or (look_up is None and mode == "RGB" and picture.mode in ("1", "L"))
+        return picture if kept else picture.convert(mode)
 
 
 def _as_array(picture: Image.Image, look_up: LookUp | None) -> np.ndarray:
@@ -396,11 +415,12 @@ def _as_array(picture: Image.Image, look_up: LookUp | None) -> np.ndarray:
 
     It is copied in strips, because Pillow copies once more what it returns.
     """
-    pixels = np.empty((picture.height, picture.width, 4 if picture.mode == "RGBA" else 3), np.uint8)
+    mode = "RGBA" if picture.mode == "RGBA" else "RGB"
+    pixels = np.empty((picture.height, picture.width, len(mode)), np.uint8)
     for top in range(0, picture.height, ROWS):
         bottom = min(top + ROWS, picture.height)
         strip = picture.crop((0, top, picture.width, bottom))
-        pixels[top:bottom] = np.asarray(look_up.to_srgb(strip) if look_up else strip)
+        pixels[top:bottom] = np.asarray(look_up.to_srgb(strip) if look_up else strip.convert(mode))
     return pixels
 
 
@@ -417,6 +437,7 @@ def _decode_16_bit(picture: ImageFile.ImageFile, path: Path) -> np.ndarray | Non
     if not deep or "transparency" in picture.info:
         return None
     size, bands, associated = picture.size, len(picture.getbands()), tags.get(EXTRASAMPLES, (0,))[0] == 1
+    check_pixels(path, *size, DEEP_PHOTO, MOST_OF_PHOTO)
     if tags.get(PLANAR_CONFIGURATION) == 2:  # a plane a channel: neither of the two decodes it right
         with _decoding(path):
             pixels = np.moveaxis(tifffile.imread(path, key=0), 0, -1)
@@ -424,7 +445,7 @@ def _decode_16_bit(picture: ImageFile.ImageFile, path: Path) -> np.ndarray | Non
     else:
         _decode(picture, path)
         check_chunks(path)
-        pixels = decode(path, cv2.IMREAD_UNCHANGED)
+        pixels = decode(path, cv2.IMREAD_UNCHANGED, *size)
         if pixels is not None:
             order = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
             pixels = cv2.cvtColor(pixels, order[pixels.ndim if pixels.ndim == 2 else pixels.shape[2]])

@@ -4,6 +4,7 @@
 `ply_file_path` names the file of structure-from-motion points.
 """
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,10 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.nda
     )
     points, colors = None, None
     if found.ply_file_path:
-        points, colors = _read_points(files.find(found.ply_file_path, suffixes=False) or folder / found.ply_file_path)
+        path = files.find(found.ply_file_path, suffixes=False) or folder / found.ply_file_path
+        if not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(folder)):
+            raise InputError(f"{path}: ply_file_path names a file outside of the capture. Move it there, or remove it.")
+        points, colors = _read_points(path)
     return views, points, colors, warnings
 
 

@@ -14,6 +14,7 @@ from typing import Literal, cast
 import numpy as np
 
 from refgs.errors import InputError, reason
+from refgs.paths import open_file
 
 LARGEST = 1 << 20  # bytes; a camera takes a few hundred, a split a few thousand
 KINDS = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
@@ -22,7 +23,7 @@ KINDS = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 def read_pair(file: Path) -> tuple[np.ndarray | list[int | str], np.ndarray | list[int | str]]:
     """Read a pickle that holds two arrays or lists, and return both. Raise InputError with a message of one line for anything else."""
     try:
-        with file.open("rb") as source:
+        with open_file(file) as source:
             data = source.read(LARGEST + 1)
         if len(data) > LARGEST:
             raise InputError(f"{file}: larger than a camera or a split can be. Download the data set again.")

@@ -18,6 +18,7 @@ from refgs.capture.images import read_codes
 from refgs.capture.reduce import reduced_map
 from refgs.capture.types import View
 from refgs.errors import InputError
+from refgs.formats.arrays import read_array
 from refgs.formats.exr import read_exr
 
 FOLDERS = {"normals": "prior_normals", "depth": "prior_depth"}  # and the field of a view that has the path
@@ -147,12 +148,10 @@ def _read(path: Path, channels: int) -> np.ndarray:
 def _read_array(path: Path, channels: int) -> np.ndarray:
     """Read an array from a NumPy file as float32 (H, W, C). In the file, its shape may be (C, H, W), and have more axes of length 1."""
     try:
-        loaded = np.load(path, allow_pickle=False)
-        if not isinstance(loaded, np.ndarray):
-            loaded = next(iter(loaded.values()))
+        loaded = read_array(path, "Save it again.")
         values = loaded.astype(np.float32)
-    except Exception as error:
-        raise InputError(f"{path}: NumPy cannot read an array from it. Save it again.") from error
+    except (OSError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: not an array of numbers. Save it again.") from error
     if np.issubdtype(loaded.dtype, np.integer):
         values /= np.iinfo(loaded.dtype).max
     values = values.squeeze()

@@ -11,6 +11,7 @@ import rawpy
 from PIL import ExifTags, Image
 
 from refgs.errors import InputError
+from refgs.paths import check_file, open_file
 
 SUFFIXES = (
     ".dng",
@@ -71,7 +72,7 @@ def read_exif(path: Path) -> dict[int, Any]:
     """Read a RAW photo's EXIF tags, from the file or from the preview in it. Raises an exception of any type if it has no EXIF."""
     exif = Image.Exif()
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             exif.load_from_fp(file)  # most formats are TIFF
             return exif.get_ifd(ExifTags.IFD.Exif)
     except Exception:
@@ -85,7 +86,10 @@ def _reading(path: Path) -> Iterator[None]:
     if not path.is_file():
         raise InputError(f"{path}: the image is missing. Put it back, or remove it from the capture.")
     try:
+        check_file(path)
         yield
+    except OSError as error:
+        raise InputError(f"{path}: the RAW photo is truncated or broken ({error.strerror}). Copy it again.") from error
     except (rawpy.LibRawFileUnsupportedError, rawpy.LibRawNotImplementedError, rawpy.NotSupportedError) as error:
         raise InputError(
             f"{path}: LibRaw does not know this camera's RAW, or the file is broken. Copy it again, or save it as DNG or 16-bit TIFF."

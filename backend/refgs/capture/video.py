@@ -21,7 +21,7 @@ from PIL import Image
 from refgs.capture.color_profiles import coded_profile
 from refgs.capture.images import as_bytes
 from refgs.errors import InputError
-from refgs.paths import disk_errors_named
+from refgs.paths import check_file, disk_errors_named
 
 SIDE = 800  # pixels on the longer side of the grey pictures that are measured; `standard` trains on as many
 FLOW_SIDE = 400  # pixels on the longer side of the pictures between which movement is measured
@@ -167,6 +167,7 @@ def _opened(video: Path) -> _Film:
     """Open a video file. Raise InputError if it is not a video, or if its header is missing because it is truncated."""
     path = os.path.abspath(video)  # FFmpeg takes what is before a colon for a protocol, but not in a path from the root
     try:
+        check_file(video)
         container = av.open(path, metadata_errors="replace")
         # A song's or a film's cover is a stream, too.
         streams = [each for each in container.streams.video if not each.disposition & Disposition.attached_pic]

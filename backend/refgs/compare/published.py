@@ -17,7 +17,8 @@ from refgs.capture.stanford_orb import novel_views
 from refgs.capture.tensoir import LIGHTS, light_folder
 from refgs.color import srgb_decode
 from refgs.compare.truth import GroundTruth, check_size
-from refgs.errors import InputError, reason
+from refgs.errors import InputError
+from refgs.formats.arrays import read_array
 from refgs.formats.panorama import directions, read_environment, sample
 
 # OpenCV's camera axes to those in which `refgs.formats.panorama` has its directions: forward, left, up.
@@ -143,11 +144,9 @@ def truth_folder(folder: Path) -> Path:
 def _load(file: Path, channels: int) -> np.ndarray:
     """Load an array (H, W) or (H, W, channels) of NumPy. Raises InputError naming the file."""
     try:
-        pixels = np.load(file, allow_pickle=False)
+        pixels = read_array(file, "Download the data set again.")
     except FileNotFoundError:
         raise InputError(f"{file} is missing") from None
-    except Exception as error:  # NumPy evaluates the header, and raises errors of many types
-        raise InputError(f"{file}: not an array of NumPy ({reason(error)}). Download the data set again.") from error
     pixels = np.squeeze(pixels)
     if pixels.shape[2:] != ((channels,) if channels > 1 else ()) or pixels.ndim < 2:
         raise InputError(f"{file}: an array of {pixels.shape}, where a picture is needed. Download the data set again.")

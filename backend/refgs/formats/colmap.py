@@ -4,17 +4,21 @@ COLMAP's own reader is not used. For a truncated file it prints an unrelated mes
 errors that name the file.
 """
 
-import mmap
+import os
 import re
 import struct
-from collections.abc import Callable
+from array import array
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 
 from refgs.errors import InputError
+from refgs.paths import LARGEST, open_file
+
+LONGEST_NAME = 65_536  # bytes of a photo's name, with its folders
 
 T = TypeVar("T")
 
@@ -109,68 +113,77 @@ def _parse(file: Path, binary: Callable[[Path], T], text: Callable[[Path], T]) -
 class _Reader:
     """Read values from a binary file one after the other. Raises struct.error or ValueError if the file is truncated."""
 
-    def __init__(self, file: Path):
-        with file.open("rb") as opened:  # mapped, not read: models of thousands of photos take gigabytes
-            self.data, self.at = mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ), 0
+    def __init__(self, file: BinaryIO):
+        self._file, self._size = file, os.fstat(file.fileno()).st_size
 
     def take(self, layout: str) -> tuple:
         layout = "<" + layout
-        values = struct.unpack_from(layout, self.data, self.at)
-        self.at += struct.calcsize(layout)
-        return values
+        return struct.unpack(layout, self._file.read(struct.calcsize(layout)))
 
     def name(self) -> str:
-        end = self.data.find(b"\0", self.at, self.at + LONGEST_NAME)
-        if end < 0:
-            raise ValueError("truncated")
-        text = self.data[self.at : end].decode("utf-8")
-        self.at = end + 1
-        return text
+        letters = bytearray()
+        while (letter := self._file.read(1)) != b"\0":
+            letters += letter
+            if not letter or len(letters) > LONGEST_NAME:
+                raise ValueError("a name without an end")
+        return letters.decode("utf-8")
 
     def skip(self, count: int) -> None:
-        self.at += count
-        if self.at > len(self.data):
+        if self._file.tell() + count > self._size:
             raise ValueError("truncated")
+        self._file.seek(count, 1)
+
+    def rows(self, kind: str) -> Iterator[int]:
+        """Count the rows that the file says it has, and yield the identifier of each, of a `kind` of struct.
+
+        Raises ValueError for two rows in a row with one identifier. A file with a hole has many: a hole reads as zeros.
+        """
+        last = None
+        for _ in range(self.take("Q")[0]):
+            (number,) = self.take(kind)
+            if number == last:
+                raise ValueError("one identifier twice")
+            last = number
+            yield number
 
 
 def _binary_cameras(file: Path) -> dict[int, Intrinsics]:
-    source, cameras = _Reader(file), {}
-    for _ in range(source.take("Q")[0]):
-        number, model, width, height = source.take("iiQQ")
+    with open_file(file) as opened:
+        return dict(_each_camera(file, _Reader(opened)))
+
+
+def _each_camera(file: Path, source: _Reader) -> Iterator[tuple[int, Intrinsics]]:
+    for number in source.rows("i"):
+        model, width, height = source.take("iQQ")
         if model not in MODELS:
             raise InputError(f"{file}: camera model number {model} is not known. {UNDISTORT}")
-        if number in cameras:
-            raise ValueError("not COLMAP's")
         name = MODELS[model][0]
-        cameras[number] = Intrinsics(name, width, height, source.take(f"{len(PARAMETERS[name])}d"))
-    return cameras
+        yield number, Intrinsics(name, width, height, source.take(f"{len(PARAMETERS[name])}d"))
 
 
 def _binary_images(file: Path) -> list[Image]:
-    source, images = _Reader(file), []
-    for _ in range(source.take("Q")[0]):
-        _, *pose, camera_id = source.take("I7di")
-        if not any(pose[:4]):  # no rotation: a file of zeros has billions of these
-            raise ValueError("not COLMAP's")
-        images.append(Image(source.name(), camera_id, tuple(pose)))
-        source.skip(24 * source.take("Q")[0])  # keypoints: x, y, point id
+    images = []
+    with open_file(file) as opened:
+        source = _Reader(opened)
+        for _ in source.rows("I"):
+            *pose, camera_id = source.take("7di")
+            images.append(Image(source.name(), camera_id, tuple(pose)))
+            source.skip(24 * source.take("Q")[0])  # keypoints: x, y, point id
     return images
 
 
 def _binary_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    source, rows, last = _Reader(file), [], None
-    for _ in range(source.take("Q")[0]):
-        number, *row = source.take("Q3d3Bd")[:7]
-        if number == last:  # numbers are unique: a file of zeros has billions of these
-            raise ValueError("not COLMAP's")
-        last = number
-        rows.append(row)
-        source.skip(8 * source.take("Q")[0])  # track: image id, keypoint
-    return _points(rows)
+    numbers = array("d")  # a list takes five times as much memory
+    with open_file(file) as opened:
+        source = _Reader(opened)
+        for _ in source.rows("Q"):
+            numbers.extend(source.take("3d3Bd")[:6])
+            source.skip(8 * source.take("Q")[0])  # track: image id, keypoint
+    return _points(numbers)
 
 
-def _points(rows: list) -> tuple[np.ndarray, np.ndarray]:
-    table = np.array(rows, dtype=np.float64).reshape(-1, 6)
+def _points(numbers: array) -> tuple[np.ndarray, np.ndarray]:
+    table = np.array(numbers).reshape(-1, 6)
     table = table[(np.abs(table) <= FARTHEST).all(axis=1)]
     return table[:, :3], table[:, 3:] / 255.0
 
@@ -180,11 +193,16 @@ def _entries(file: Path, first: Callable[[str], bool] = lambda line: True) -> li
 
     Raises ValueError if the file has fewer entries than its header says.
     """
-    if file.stat().st_size > LARGEST_TEXT:
-        raise ValueError("larger than such a file can be")
-    lines = file.read_text(encoding="utf-8").splitlines()
-    entries = [line for line in lines if line.strip() and not line.startswith("#") and first(line)]
-    counted = next((match for line in lines if (match := re.match(r"# Number of \w+: (\d+)", line))), None)
+    entries, counted = [], None
+    with open_file(file) as opened:
+        while data := opened.readline(LARGEST):
+            if len(data) == LARGEST:
+                raise ValueError("a line without an end")
+            line = data.decode("utf-8").rstrip("\r\n")
+            if line.startswith("#"):
+                counted = counted or re.match(r"# Number of \w+: (\d+)", line)
+            elif line.strip() and first(line):
+                entries.append(line)
     if counted and len(entries) < int(counted[1]):
         raise ValueError("fewer entries than counted")
     return entries
@@ -226,4 +244,10 @@ def _is_image(line: str) -> bool:
 
 
 def _text_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    return _points([[float(value) for value in line.split()[1:7]] for line in _entries(file)])
+    numbers = array("d")
+    for line in _entries(file):
+        row = [float(value) for value in line.split()[1:7]]
+        if len(row) < 6:
+            raise ValueError("numbers missing")
+        numbers.extend(row)
+    return _points(numbers)

@@ -2,7 +2,6 @@
 
 import errno
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -88,7 +87,7 @@ def read_exr(path: str | os.PathLike, is_data: bool = False) -> np.ndarray:
             parts = [file.channels(i) for i in range(len(file.parts))]
             number = next((i for i, part in enumerate(parts) if {"R", "G", "B"} <= part.keys()), 0)
             channels = {name: channel.pixels for name, channel in parts[number].items()}
-            primaries = headers[number].get("chromaticities", REC709)
+            primaries = np.array(headers[number].get("chromaticities", REC709), np.float64)
     except (InputError, MemoryError):
         raise
     except Exception:  # the binding raises RuntimeError, ValueError or its own errors
@@ -105,9 +104,9 @@ def read_exr(path: str | os.PathLike, is_data: bool = False) -> np.ndarray:
     )
 
 
-def _as_rec709(path: Path, pixels: np.ndarray, primaries: Sequence[float]) -> np.ndarray:
+def _as_rec709(path: Path, pixels: np.ndarray, primaries: np.ndarray) -> np.ndarray:
     """Convert linear pixels (H, W, 3 | 4), in place, from these chromaticities. Colours beyond Rec.709 become negative."""
-    if np.allclose(primaries, REC709, atol=1e-3):
+    if primaries.shape == np.shape(REC709) and np.allclose(primaries, REC709, atol=1e-3):
         return pixels
     try:
         matrix = primaries_to_rec709(primaries).astype(np.float32)

@@ -1,9 +1,9 @@
 """Read and write textured meshes as binary glTF 2.0. Textures are also written beside the mesh."""
 
-import io
 import json
 import os
 import struct
+from io import BytesIO
 from pathlib import Path
 from typing import cast
 
@@ -17,8 +17,9 @@ from refgs.errors import InputError, reason
 from refgs.formats.mesh import Y_UP, Mesh, UnwrappedMesh, check_mesh
 from refgs.formats.tangents import vertex_tangents
 from refgs.formats.textures import FOLDER, Textures, write_textures
-from refgs.paths import read_bytes, whole
+from refgs.paths import open_file, whole
 
+LARGEST = 512 << 20  # bytes of a file with four textures of 8192 pixels and a million triangles
 SPECULAR = "KHR_materials_specular"
 
 
@@ -74,11 +75,19 @@ def write_glb(path: str | os.PathLike, mesh: UnwrappedMesh, textures: Textures) 
 
 
 def read_glb(path: str | os.PathLike) -> Mesh:
-    """Read the vertices and faces of a file that `write_glb` wrote. They are turned back to Z up. Raises InputError for a broken file."""
+    """Read the vertices and faces of a file that `write_glb` wrote. They are turned back to Z up. Raises InputError for a broken file.
+
+    A file that names other files, as glTF may, is refused.
+    """
     try:
-        data = read_bytes(Path(path))
+        with open_file(path) as file:
+            data = file.read(12)  # "glTF", the version and the length (glTF 2.0, 4.4.2)
+            length = int.from_bytes(data[8:], "little")
+            if data[:4] != b"glTF" or not 12 <= length <= LARGEST:
+                raise ValueError("its header is another file's")
+            data += file.read(length - 12)
         _check_self_contained(data)
-        model = trimesh.load_mesh(io.BytesIO(data), file_type="glb", process=False, skip_materials=True)
+        model = trimesh.load_mesh(BytesIO(data), file_type="glb", process=False, skip_materials=True)
         vertices, faces = np.asarray(model.vertices, np.float64), np.asarray(model.faces)
     except Exception as error:  # trimesh raises errors of many types
         raise InputError(

@@ -10,7 +10,7 @@ import trimesh
 
 from refgs.errors import InputError, reason
 from refgs.formats.ply import check_header
-from refgs.paths import whole
+from refgs.paths import open_file, whole
 
 FARTHEST = 1e30  # of a vertex, in world units: squares of single-precision numbers must be finite
 Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # rotation from Z up to the Y up of glTF (2.0, 3.4) and OBJ
@@ -59,7 +59,7 @@ def read_mesh(path: str | os.PathLike) -> Mesh:
     if not path.is_file():
         raise InputError(f"{path} is missing, or is no file: train again")
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             check_header(file, path)
         mesh = trimesh.load_mesh(path, file_type="ply", process=False)
         mesh = Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces))

@@ -1,22 +1,27 @@
 """Refuse pictures by the size that they declare, before memory is taken for their pixels. Decode some by OpenCV."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from refgs.errors import InputError
-from refgs.paths import check_file, open_file
+from refgs.paths import LARGEST, check_file, open_file
 
 # First bytes of what OpenCV is given: PNG, TIFF of either endianness, Radiance. By these it chooses the decoder, whatever a file's name.
 _DECODED = (b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"#?RADIANCE", b"#?RGBE")
 
-MOST = 256_000_000  # pixels; cameras take up to 200 million, or 240 by shifting the sensor. Decoding takes 7 bytes or more a pixel
+MOST = 256_000_000  # pixels; cameras take up to 200 million, or 240 by shifting the sensor
 # A larger picture in a file so small that this many pixels share a byte is taken for a broken one. A PNG of one colour has 1032 to 8256, by
 # deflate's limit, and a JPEG at most 341.
 SMALL, MOST_PER_BYTE = 100_000_000, 10_000
-PHOTO_PER_BYTE = 50  # the same for photos, which are not of one colour as masks are; those of phones have at most 10
-MOST_SCANS = 100  # of a JPEG; progressive ones have about ten. Each is decoded in the time of a whole picture
+# A photo of so many pixels is decoded in 1 GB: a pixel takes 8 bytes, or 16 with 16 bits a channel. Photos of more are read if they are
+# as large as photos are: the flattest has 20 pixels a byte. Masks, which take less memory, are not bound by this.
+PHOTO, DEEP_PHOTO, MOST_OF_PHOTO = 130_000_000, 65_000_000, 64
+LONGEST = 512 << 20  # bytes of a photo in a file that is read as a whole
+_SEGMENT = re.compile(rb"\xff([^\x00\x01\xd0-\xd8\xff])")
+SCANS = 100  # of a JPEG; cameras write 1, and programs 10 of a progressive one. Each takes as long as decoding the photo once
 
 
 def check_pixels(path: Path, width: int, height: int, small: int = SMALL, per_byte: int = MOST_PER_BYTE) -> None:
@@ -31,17 +36,16 @@ def check_pixels(path: Path, width: int, height: int, small: int = SMALL, per_by
         raise InputError(f"{size} do not fit into so small a file: it is broken. Replace it, or save it as PNG.")
 
 
-def check_photo(path: Path, width: int, height: int) -> None:
-    """Raise InputError if a file would take far more memory or time to decode than any photo of its size.
+def check_length(path: Path) -> None:
+    """Check the file of a photo before Pillow opens it. Raises OSError if it is no ordinary file, or empty.
 
-    Masks are not checked by this function, because they may be of one colour.
+    Raises ValueError for a WebP, HEIC or AVIF of more than LONGEST bytes: these are read as a whole.
     """
-    check_pixels(path, width, height, per_byte=PHOTO_PER_BYTE)
-    with open_file(path) as file:
-        jpeg = file.read(2) == b"\xff\xd8"
-        if jpeg and file.read().count(b"\xff\xda") > MOST_SCANS:  # start of scan (ITU-T T.81, B.1.1.3)
-            why = f"this JPEG has more than {MOST_SCANS} scans, which takes too long to read"
-            raise InputError(f"{path}: {why}. Save it anew.")
+    check_file(path)
+    if path.stat().st_size > LONGEST:
+        with open_file(path) as file:
+            if (head := file.read(8))[:4] == b"RIFF" or head[4:] == b"ftyp":
+                raise ValueError("larger than such a photo can be")
 
 
 def check_chunks(path: Path) -> None:
@@ -61,29 +65,50 @@ def check_chunks(path: Path) -> None:
             file.seek(length + 4, 1)
 
 
+def check_scans(path: Path, width: int, height: int) -> None:
+    """Raise InputError if a JPEG has more than SCANS scans, by which a small file would be decoded for minutes.
+
+    A segment is 0xFF, a letter, its length, and that many bytes less two. In the pixels' code after it, 0xFF stands only before 0 and the
+    letters of restarts (ITU-T T.81, annex B).
+    """
+    with open_file(path) as file:
+        data = file.read(min(8 * width * height + LARGEST, LONGEST))
+    count, at = 0, 2
+    while (found := _SEGMENT.search(data, at)) and found[1] != b"\xd9":  # the end
+        count += found[1] == b"\xda"
+        at = found.end() + int.from_bytes(data[found.end() : found.end() + 2], "big")
+    if count > SCANS:
+        raise InputError(f"{path}: the JPEG has more than {SCANS} scans, which take too long to decode. Save it again.")
+
+
 def read_png(path: Path, flags: int = -1) -> np.ndarray | None:
     """Read a PNG of a run as `cv2.imread` does. Return None if it is missing, broken, too large, or no PNG."""
     try:
         check_file(path)
         with Image.open(path, formats=("PNG",)) as picture:
-            check_pixels(path, *picture.size)
+            size = picture.size
+            check_pixels(path, *size)
         check_chunks(path)
-        return decode(path, flags)
+        return decode(path, flags, *size)
     except Exception:  # Pillow's have no common class
         return None
 
 
-def decode(path: Path, flags: int) -> np.ndarray | None:
+def decode(path: Path, flags: int, width: int, height: int) -> np.ndarray | None:
     """Decode a PNG, TIFF or Radiance picture as `cv2.imread` does. Return None if it is broken or another kind of picture.
 
-    OpenCV would read many more kinds, by decoders that nobody needs here. That of JPEG 2000 in 4.11 writes out of bounds (CVE-2025-53644).
-    Raises OSError if the file cannot be read.
+    `width` and `height` are what its header says. OpenCV would read many more kinds, by decoders that nobody needs here. That of JPEG 2000
+    in 4.11 writes out of bounds (CVE-2025-53644). Raises OSError if the file cannot be read, and InputError if it is far larger than its
+    pixels can be.
     """
     import cv2  # here, because most lights are EXR
 
     with open_file(path) as file:
         if not file.read(16).startswith(_DECODED):
             return None
+        # A pixel takes 16 bytes at most. Twice that and some megabytes leave room for previews and metadata.
+        if path.stat().st_size > 32 * width * height + LARGEST:
+            raise InputError(f"{path} is larger than its {width}×{height} pixels can be. Save it again.")
         file.seek(0)
         data = np.frombuffer(file.read(), np.uint8)
     try:

@@ -8,9 +8,9 @@ from pathlib import Path
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from refgs.errors import InputError
-from refgs.paths import whole
+from refgs.paths import open_file, whole
 
-LONGEST_HEADER = 100_000  # bytes
+LONGEST_HEADER, LONGEST_LINE = 100_000, 1 << 20  # bytes; a row of 3DGS takes about a thousand
 _BYTES = {
     **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
     **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
@@ -27,7 +27,7 @@ def read_ply(path: str | os.PathLike) -> PlyData:
     """
     path = Path(path)
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             check_header(file, path)
         return PlyData.read(str(path))
     except OSError as error:
@@ -54,11 +54,12 @@ def check_header(file, path: Path) -> None:
     if len(lines) < 2 or len(lines[1]) < 2:
         raise InputError(f"{path} has a header that does not name its format: export it again")
     text = lines[1][1] == "ascii"
-    need, rows, last = 0, 0, 0
+    need, rows, last, most = 0, 0, 0, 0.0
     for count, properties in _elements(lines[2:], path):
         # In text a value takes a digit and a blank at least. A list may be empty: only its length counts.
-        least = 2 * len(properties) if text else sum(properties)
+        least = 2 * len(properties) if text else sum(size for size, _ in properties)
         need, rows, last = need + count * least, rows + count, least
+        most += count * sum(largest for _, largest in properties)
     there = os.fstat(file.fileno()).st_size - end.end()
     if need > there + text:  # the last line of text may lack its line break
         raise InputError(
@@ -66,20 +67,30 @@ def check_header(file, path: Path) -> None:
         )
     if text:
         file.seek(end.end())
-        over = sum(not line.isspace() for line in file) > rows
+        over = _count_lines(file, path) > rows
     else:
-        over = there - need >= last > 0 and not any(line[1:2] == ["list"] for line in lines)
+        over = there - need >= last > 0 and there > most
     if over:
         raise InputError(f"{path} holds more rows than its header says: copy or export it again")
 
 
-def _elements(lines: list[list[str]], path: Path) -> list[tuple[int, list[int]]]:
+def _count_lines(file, path: Path) -> int:
+    """Count the lines in the rest of a file, without those that are blank. Raises InputError for a line that no row can be."""
+    count = 0
+    while line := file.readline(LONGEST_LINE):
+        if len(line) == LONGEST_LINE:
+            raise InputError(f"{path} has a row of more than {LONGEST_LINE:,} bytes: copy or export it again")
+        count += not line.isspace()
+    return count
+
+
+def _elements(lines: list[list[str]], path: Path) -> list[tuple[int, list[tuple[int, float]]]]:
     """Parse the header of a PLY file. Returns, for each element, its number of rows and a list of sizes.
 
-    The sizes are the bytes of each property. For a list property, only the number that stores its length counts, because a list may be
-    empty. Raises InputError for a broken header.
+    The sizes are the fewest and the most bytes of each property in a binary file. They differ for a list, which has a number that stores
+    its length, and may be empty. Raises InputError for a broken header.
     """
-    elements: list[tuple[int, list[int]]] = []
+    elements: list[tuple[int, list[tuple[int, float]]]] = []
     for line in lines:
         match line:
             case ["element", _, count] if count.isdecimal():
@@ -90,7 +101,9 @@ def _elements(lines: list[list[str]], path: Path) -> list[tuple[int, list[int]]]
                 kinds = kinds[-2:]  # a list has two types: of its length and of its values
                 if wrong := {*kinds} - {*_BYTES}:
                     raise InputError(f"{path} has properties of an unknown type, {wrong.pop()}: export it again")
-                elements[-1][1].append(_BYTES[kinds[0]])
+                size = _BYTES[kinds[0]]
+                length = (255.0 if size == 1 else float("inf")) if len(kinds) == 2 else 0.0
+                elements[-1][1].append((size, size + length * _BYTES[kinds[-1]] if length else float(size)))
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
