@@ -362,7 +362,7 @@ def _report_download(home: Path, fetching: dict[str, str], ended: threading.Even
 
 def _start_trainer(python: Path) -> None:
     """Start the installed trainer once. Raises _Failed unless the trainer reports that it is ready."""
-    process = _start([str(python), "-E", "-m", "refgs.cli", "worker"])
+    process = _start([str(python), "-E", "-P", "-m", "refgs.cli", "worker"])
     heard = process.communicate()[0].splitlines()
     event = json.loads(heard[0]) if process.returncode == 0 and heard else {}
     if event.get("event") != "ready":

@@ -50,7 +50,7 @@ class Job:
     commands: list[dict]
     log: Path
     run: Path | None = None  # run folder that the job works in, or a batch's LOGS; such jobs run one at a time
-    arguments: tuple[str, ...] = ("-E", "-m", "refgs.cli", "worker")  # of that Python
+    arguments: tuple[str, ...] = ("-E", "-P", "-m", "refgs.cli", "worker")  # of that Python
     program: str = TRAINER
     state: str = "waiting"
     line: str = ""  # current step; at the end, the error

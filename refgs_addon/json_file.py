@@ -4,12 +4,13 @@ import json
 from pathlib import Path
 
 from .errors import InputError
+from .ordinary import read_text
 
 
 def read_json(path: Path) -> dict | list:
     """Read a JSON file that holds a dictionary or a list. Raises InputError if it is missing, broken or holds something else."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(read_text(path))
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
     except (ValueError, RecursionError):  # the latter if it is nested too deeply

@@ -9,6 +9,7 @@ from typing import BinaryIO
 import numpy as np
 
 from .errors import InputError
+from .ordinary import open_file
 
 LONGEST_HEADER = 100_000  # bytes
 PLY_TYPES = {  # numpy types by PLY's newer names, and by the older ones, which all readers know
@@ -34,7 +35,7 @@ def read_rows(path: Path) -> np.ndarray:
     if "vertex" not in (name for name, _, _ in elements):
         raise InputError(f"{path} has no element vertex: it is not a PLY file of splats")
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             file.seek(start)
             _check_size(file, order, elements, path)
             read = _read_text if not order else _read_binary
@@ -49,7 +50,7 @@ def read_rows(path: Path) -> np.ndarray:
 def read_header(path: Path) -> tuple[list[list[str]], int]:
     """Read the header of a PLY file: the words of each line, and the number of bytes before the first row. Raises InputError."""
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             head = file.read(LONGEST_HEADER)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None

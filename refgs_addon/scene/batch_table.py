@@ -1,7 +1,6 @@
 """Read the table that a batch writes, with a row for each run, and hold it for the panel."""
 
 import math
-import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +11,7 @@ from ..errors import InputError
 from ..json_file import read_json
 
 ROWS = "rows.json"  # in the batch's LOGS, as in backend/refgs/batch/batch.py
+LOG, PICTURE = (".log", ".txt"), (".png",)
 _STEPS = {
     "poses": "finding cameras",
     "masks": "making masks",
@@ -54,22 +54,21 @@ def read_rows(folder: Path) -> list[Row]:
             name, state, what = (str(facts[key]) for key in ("name", "state", "what"))
             if state in ("waiting", "running") and not going:
                 state = "stopped"
-            files = (
-                _inside(folder, str(facts[key] or ""), kind) for key, kind in (("log", ".log"), ("picture", ".png"))
-            )
+            files = (_inside(folder, facts[key], endings) for key, endings in (("log", LOG), ("picture", PICTURE)))
             rows.append(Row(name, state, _words(state, facts), what, *files))
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
             continue
     return rows
 
 
-def _inside(folder: Path, path: str, suffix: str) -> str:
-    """Return a path that a table names, or "" if it is not a file with this suffix in the batch's folder.
+def _inside(folder: Path, path: object, endings: tuple[str, ...]) -> str:
+    """Return the path of a file if it is one in the batch's folder, with one of these endings, otherwise "".
 
-    The panel opens the file with the program that the system has for it. Of a program, that would run it.
+    The system opens what the panel shows. A table that came with a folder must not choose a program for that.
     """
-    inside = os.path.realpath(path).startswith(os.path.realpath(folder) + os.sep)
-    return path if inside and path.endswith(suffix) and os.path.isfile(path) else ""
+    file = Path(str(path or "")).resolve()
+    known = file.is_relative_to(folder.resolve()) and file.suffix.lower() in endings and file.is_file()
+    return str(path) if known else ""
 
 
 def _words(state: str, facts: dict) -> str:

@@ -8,6 +8,7 @@ from mathutils import Matrix
 
 from ..errors import InputError
 from ..json_file import read_json
+from ..ordinary import check_file
 
 LARGEST = 1e6  # pixels of a photo or of a focal length; Blender stores single-precision numbers
 SENSOR_WIDTH = 36.0  # mm, Blender's default
@@ -102,8 +103,9 @@ def show_photo(camera: bpy.types.Object, amount: float = 1.0) -> None:
         if not data.get(PHOTO):
             raise InputError(f"{camera.name} has no photo: choose a camera of an imported run or of a checked capture")
         try:
+            check_file(path)
             image = bpy.data.images.load(str(path), check_existing=True)
-        except RuntimeError:
+        except (OSError, RuntimeError):
             raise InputError(f"the photo {path} does not exist: move the capture back to where it was") from None
         layer = data.background_images.new()
         layer.image, layer.display_depth, layer.frame_method = image, "FRONT", "STRETCH"

@@ -1,7 +1,5 @@
 """Import a run folder, the result of a training: its splats, mesh and cameras, and the light recovered from the photos."""
 
-import json
-import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,6 +9,7 @@ from mathutils import Matrix
 from ..errors import InputError
 from ..json_file import read_json
 from ..nodes.world_diffuse import add_world_diffuse
+from ..ordinary import check_gltf
 from . import run_parts
 from .camera_objects import add_camera, frame_camera, light_of, read_cameras
 from .capture_cameras import replace_cameras
@@ -149,7 +148,7 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
 
     Vertices that the file doubles at the seams of the textures are merged, so that the mesh is closed.
     """
-    _check_self_contained(path)
+    check_gltf(path)
     before, units = set(bpy.data.objects), bpy.context.scene.unit_settings
     # The importer takes the file's units for metres; the splats' are Blender's.
     length, units.scale_length = units.scale_length, 1.0
@@ -177,30 +176,6 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
     if not meshes:
         raise InputError(f"{path} contains no mesh: export the run again")
     return meshes
-
-
-def _check_self_contained(path: Path) -> None:
-    """Raise InputError if a GLB names other files: Blender's importer would read any file of the computer that a run names.
-
-    A GLB has a header of 12 bytes, then the length and the kind of a JSON chunk, then the chunk (glTF 2.0 specification).
-    """
-    try:
-        with open(path, "rb") as file:
-            length, kind = struct.unpack("<12xI4s", file.read(20))
-            tree = json.loads(file.read(length)) if kind == b"JSON" else {}
-        inside = not any("uri" in entry for kind in ("buffers", "images") for entry in tree.get(kind, ()))
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
-    except (
-        struct.error,
-        ValueError,
-        AttributeError,
-        TypeError,
-        RecursionError,
-    ):  # Blender's importer says what is wrong
-        return
-    if not inside:
-        raise InputError(f"{path} names other files, which runs never do: export the run again")
 
 
 def _doubt_words(folder: Path) -> str:

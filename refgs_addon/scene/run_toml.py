@@ -4,6 +4,8 @@ import math
 import tomllib
 from pathlib import Path
 
+from ..ordinary import read_text
+
 MANIFEST = Path(__file__).resolve().parents[2] / "blender_manifest.toml"
 
 
@@ -38,7 +40,7 @@ def _release(version: str) -> tuple[int, ...]:
 
 def _table(run: Path, name: str) -> dict:
     try:
-        table = tomllib.loads((run / "run.toml").read_text(encoding="utf-8")).get(name)
+        table = tomllib.loads(read_text(run / "run.toml")).get(name)
     except (OSError, ValueError, RecursionError):
         return {}
     return table if isinstance(table, dict) else {}

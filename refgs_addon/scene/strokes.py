@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..errors import InputError
+from ..ordinary import check_file, open_file
 from .atomic_file import atomic_write
 from .camera_objects import PHOTO
 
@@ -170,8 +171,9 @@ def _read(path: Path, width: int, height: int, turns: int = 0) -> "np.ndarray":
     import numpy as np
 
     try:
+        check_file(path)
         image = bpy.data.images.load(str(path), check_existing=False)
-    except RuntimeError:
+    except (OSError, RuntimeError):
         raise InputError(f"{path} does not exist: move the capture back to where it was") from None
     try:
         if not image.has_data and not image.size[0]:
@@ -192,7 +194,8 @@ def _read_photo(path: Path, width: int, height: int) -> "np.ndarray":
 def exif_orientation(path: Path) -> int:
     """Return the EXIF orientation of a JPEG file, 1 to 8; 1 if the file says nothing. Blender itself ignores it."""
     try:
-        data = path.read_bytes()[: 1 << 17]
+        with open_file(path) as file:
+            data = file.read(1 << 17)
         at = 2
         while data[:2] == b"\xff\xd8" and data[at] == 0xFF and data[at + 1] != 0xDA:
             size = struct.unpack_from(">H", data, at + 2)[0]

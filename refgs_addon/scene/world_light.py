@@ -7,6 +7,7 @@ import bpy
 from ..errors import InputError
 from ..nodes.panorama_world import IMAGE, RECOVERED, get_light, is_panorama, panorama_world, set_light
 from ..nodes.world_diffuse import NAME, set_harmonics
+from ..ordinary import check_file
 
 ENDINGS = (".exr", ".hdr")
 LIGHT = "refgs_light"  # custom property of the node group that corrects diffuse light: the light it is set to
@@ -23,8 +24,9 @@ def hdris(folder: Path | None = None) -> list[Path]:
 def load_panorama(path: Path) -> bpy.types.Image:
     """Load an equirectangular panorama (EXR or HDR, linear). Raises InputError where it cannot be read."""
     try:
+        check_file(path)
         image = bpy.data.images.load(str(path))
-    except RuntimeError:
+    except (OSError, RuntimeError):
         raise InputError(f"cannot read the light {path}: choose an EXR or HDR panorama") from None
     if min(image.size) == 0:  # Blender loads a file that it cannot decode as an empty image
         bpy.data.images.remove(image)

@@ -464,7 +464,7 @@ def names_another_file(path):
         ("cameras.json", changed_camera(cx=10**400), "not the cameras.json"),
         ("environment.exr", not_json, "not a complete EXR"),
         ("mesh.glb", cut, "glTF"),
-        ("mesh.glb", names_another_file, "names other files"),
+        ("mesh.glb", names_another_file, "names a file outside of its folder"),
     ],
 )
 def test_a_broken_folder_leaves_nothing_behind(run_folder, scene, name, spoil, says):

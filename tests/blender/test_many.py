@@ -57,18 +57,6 @@ def test_what_a_killed_batch_left_is_stopped(results):
     assert [row.state for row in batch_table.read_rows(results)] == ["done", "failed", "stopped", "stopped"]
 
 
-def test_a_table_opens_only_logs_of_its_own_folder(tmp_path):
-    inside, program, outside = (tmp_path / name for name in ("runs/logs/cup/train.log", "runs/a.bat", "b.log"))
-    for file in (inside, program, outside):
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text("text")
-    (tmp_path / "runs" / "link.log").symlink_to(outside)
-    links = tmp_path / "runs" / "link.log", tmp_path / "runs" / "logs" / ".." / ".." / "b.log"
-    logs = [inside, program, outside, *links, tmp_path / "runs" / "none.log"]
-    write_table(tmp_path / "runs", *(row(f"run {n}", "failed", log=str(log)) for n, log in enumerate(logs)))
-    assert [row.log for row in batch_table.read_rows(tmp_path / "runs")] == [str(inside), "", "", "", "", ""]
-
-
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", '{"rows": 3}', '{"rows": [3, {"name": "a"}, {"name": "b", "state": null}]}']
 )
@@ -241,3 +229,26 @@ def test_a_small_batch_is_stopped_and_resumed(addon, ball_capture, tmp_path):
         and "not an image" in rows["broken"].what
         and Path(rows["broken"].log).is_file()
     )
+
+
+def test_only_logs_and_pictures_of_the_batch_are_opened(tmp_path):
+    """Check that a table that came with a folder cannot make *Open Log* run a program."""
+    runs, logs = tmp_path / "runs", tmp_path / "runs" / "logs" / "cup"
+    logs.mkdir(parents=True)
+    for file in (logs / "train.log", logs / "train.bat", tmp_path / "other.log", runs / "a.png"):
+        file.write_text("text")
+    (runs / "link.log").symlink_to(tmp_path / "other.log")
+    asked = [
+        logs / "train.log",
+        logs / "train.bat",
+        tmp_path / "other.log",
+        runs / "link.log",
+        runs / ".." / "other.log",
+    ]
+    asked += [runs / "gone.log", "//server/a.log", "https://example.org/a.log", runs]
+    write_table(runs, *(row(str(i), "failed", log=str(log), picture=str(log)) for i, log in enumerate(asked)))
+    found = batch_table.read_rows(runs)
+    assert [one.log for one in found] == [str(asked[0]), *[""] * (len(asked) - 1)]
+    assert {one.picture for one in found} == {""}
+    write_table(runs, row("cup", picture=str(runs / "a.png"), log=str(runs / "a.png")))
+    assert [(one.picture, one.log) for one in batch_table.read_rows(runs)] == [(str(runs / "a.png"), "")]
