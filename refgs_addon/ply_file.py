@@ -1,4 +1,4 @@
-"""Read PLY files (Turk 1994) without bpy. The trainer reads the same files: tests/makers/plys.py has the cases."""
+"""Read PLY files (Turk 1994) without bpy. The trainer reads the same files, which tests/makers/plys.py lists."""
 
 import itertools
 import os
@@ -99,7 +99,10 @@ def _parse(lines: list[list[str]], path: Path) -> tuple[str, list[Element]]:
 
 
 def _check_size(file: BinaryIO, order: str, elements: list[Element], path: Path) -> None:
-    """Check that a file is as long as its header says, before memory is reserved for it. A list may be empty: its length counts."""
+    """Raise InputError if a file's length does not fit its header. This is done before memory is reserved for the rows.
+
+    The length of a list is not in the header: only the number that gives it is counted.
+    """
     start = file.tell()
     there, need, last = os.fstat(file.fileno()).st_size - start, 0, 0
     for _, count, properties in elements:
@@ -170,7 +173,7 @@ def _length(value: float) -> int:
 
 
 def _number(kind: str, word: bytes | str) -> float | int:
-    """Parse a number of text. Raises ValueError for one that the type has not, or an empty word: the line is too short."""
+    """Parse a number of the PLY type `kind`. Raises ValueError if it does not fit the type, or if `word` is empty: the line is short."""
     types = np.dtype(PLY_TYPES[kind])
     if not word:
         raise ValueError("early end of line")

@@ -162,10 +162,10 @@ def train(asked: Asked, once: bool = False) -> None:
 
 @contextmanager
 def _signals_to_stop(repeat: float | None = CHECKPOINT_BY, end: float = END_BY) -> Iterator[list[int]]:
-    """Collect the signals SIGINT and SIGTERM of a `with` block in a list, which is yielded. A second signal ends the block at once.
+    """Yield a list to a `with` block, and append each SIGINT or SIGTERM that arrives to it. A second signal ends the block at once.
 
-    If the first signal is SIGTERM, another SIGTERM is sent after `repeat` seconds, unless `repeat` is None. After `end` seconds, the
-    process exits, even if it is busy.
+    After a first SIGTERM, the process sends itself another one `repeat` seconds later, unless `repeat` is None. It exits `end` seconds
+    after the SIGTERM, even if it is busy.
     """
     stopped, timers = [], []
 

@@ -93,8 +93,8 @@ def _switch_off_elsewhere(value: bpy.types.NodeSocket) -> None:
 def set_harmonics(tree: bpy.types.ShaderNodeTree, harmonics: Sequence[Sequence[float]], window: float) -> None:
     """Set the world's light. `harmonics` are nine coefficients (9, 3) of its irradiance over π, in linear Rec.709.
 
-    Their order is 1; x, y, z; xy, yz, 3z² − 1, xz, x² − y². They do not include the harmonics' constants, BANDS and THIRD. `window` is the
-    factor by which Eevee weakens the second band.
+    Their order is 1; x, y, z; xy, yz, 3z² − 1, xz, x² − y². This function multiplies them by the harmonics' constants, BANDS and THIRD.
+    `window` is the factor by which Eevee weakens the second band.
     """
     constants = (BANDS[0], *[BANDS[1]] * 3, *THIRD)
     for number, (rgb, constant) in enumerate(zip(harmonics, constants, strict=True)):
@@ -124,9 +124,10 @@ def add_world_diffuse(material: bpy.types.Material, occlusion: bpy.types.NodeSoc
 
 
 def surface_inputs(material: bpy.types.Material) -> dict[str, list[bpy.types.NodeSocket]]:
-    """Find the sockets that take a material's base colour, metallic and roughness. The material may have this group.
+    """Find the sockets that take a material's base colour, metallic and roughness.
 
-    Returns lists of sockets under the names of the Principled BSDF's inputs, such as "Base Color".
+    Returns lists of sockets under the names of the Principled BSDF's inputs, such as "Base Color". If the material has the group
+    `RefGS World Diffuse`, its inputs are listed: Base Color in place of the BSDF's, Metallic in addition.
     """
     shader, node = principled(material), material.node_tree.nodes.get(NAME)
     found = {name: [shader.inputs[name]] for name in ("Base Color", "Metallic", "Roughness")}

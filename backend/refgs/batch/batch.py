@@ -65,7 +65,7 @@ class Batch:
     """Follow the trainings of a list, or of a folder of captures, from their first step to the page about all of them."""
 
     def __init__(self, source: Path, out: Path, ask: Ask, device: str, report: Report):
-        """Read and check the list. Raises InputError if it is wrong."""
+        """Read and check the trainings that `source` lists. Raises InputError if something is wrong with them."""
         self._source, self._out, self._ask, self._device, self._report = source, out.resolve(), ask, device, report
         self._runs: dict[str, _Run] = {}
         self._references: dict[Step, Any] = {}  # trainings of one capture share its first steps
@@ -74,10 +74,13 @@ class Batch:
         self._jobs = read_jobs(source, out, ask)
 
     def run(self, engine: Engine, stop: Callable[[int, int, float], bool]) -> int:
-        """Run all steps. Returns the exit status: 0 on success, TRY_AGAIN if the batch was stopped or a failure may pass, else 1 or 2.
+        """Run all steps. Captures that are added while the batch runs are trained, too.
 
-        `stop(done, total, seconds)` is called about once a second. If it returns True, all commands are ended; trainings write checkpoints
-        first. Captures that are added while the batch runs are trained, too.
+        Returns the exit status: TRY_AGAIN if the batch was stopped, or if a step failed for a reason that may pass. Otherwise it is that
+        of a failed step, 1 or 2, or 0 if none failed.
+
+        `stop(done, total, seconds)` is called about once a second, with the numbers of ended and of all runs, and the seconds so far.
+        If it returns True, all commands are ended; trainings write checkpoints first.
         """
         if self._device == "cuda" and not engine.cards:
             raise InputError("--device cuda: no machine here has a CUDA card that Ray knows of: take auto or cpu")
@@ -119,7 +122,7 @@ class Batch:
         return Row(run.job.name, run.job.capture, state, run.seconds, what, log, step, part, *known)
 
     def _write_rows(self) -> None:
-        """Write the table for other programs."""
+        """Write rows.json, in which other programs read the state of each run."""
         self._wrote = time.monotonic()
         write_rows(self._out / LOGS / ROWS, [self._row(run) for run in self._runs.values()])
 
@@ -157,7 +160,7 @@ class Batch:
         self._report("ended", {"run": run.job.name, "what": f"{run.job.name}: {what}"})
 
     def _look(self, run: _Run) -> None:
-        """Read the figures and the picture that a run has so far."""
+        """Read a run's metrics and find its first rendered test view, as far as the run folder has them."""
         folder = self._out / run.job.name
         run.figures, run.picture = figures_of(folder), picture_of(folder)
 
@@ -175,7 +178,7 @@ class Batch:
             self._write_rows()
 
     def _added(self) -> list[Job]:
-        """Read the list of captures again. Return the trainings that were added, none if the list has an error. Warn once of each error."""
+        """Read the captures again. Return the trainings that were added. If the list has an error, warn once of it and return []."""
         self._looked = time.monotonic()
         try:
             jobs = read_jobs(self._source, self._out, self._ask)

@@ -73,10 +73,10 @@ def recorded(step: Step) -> Outcome | None:
 
 
 def run_step(step: Step, cores: int, pause: float, depot: Any, optional: tuple[bool, ...], *before: Outcome) -> Outcome:
-    """Run a step and record its outcome beside its log. If a step before it failed and may not fail, it is not run.
+    """Run a step and record its outcome beside its log. It is not run if an earlier step failed that must succeed.
 
     `cores` is the number of threads. `depot` copies files from and to the batch's machine; it is None if all steps run there. `before` are
-    the outcomes of the steps that come before this one, and `optional` says which of these steps may fail.
+    the outcomes of the earlier steps that this one waits for. `optional` says for each of them whether it may fail.
 
     Waits `pause` seconds and raises TryLater if the command was killed, if its exit status means that a retry may succeed, or if files
     cannot be copied or written.

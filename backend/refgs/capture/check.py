@@ -36,7 +36,7 @@ LAYOUTS = {
 def check(capture: Capture, out: Path) -> dict[str, Any]:
     """Check a capture. Write cameras.json, and thumbnails of up to 12 photos, so that another program can display the capture.
 
-    They are written to the folder `out`, and replace files of an earlier check. Returns a dict: the paths `capture`, `cameras` and
+    These files are written to the folder `out`, over those of an earlier check. Returns a dict: the paths `capture`, `cameras` and
     `thumbnails`; `centre` and `radius` of the region of interest, in the coordinates of cameras.json; and `lines`, the text from
     `describe`. Raises InputError if a photo or mask cannot be read.
     """

@@ -34,7 +34,7 @@ from refgs.formats.colmap import (
 class Model(NamedTuple):
     """Hold where a COLMAP capture's files are: its sparse model `folder` and the folder of its `photos`.
 
-    `root` holds the folder `masks`, and mostly the folder of photos. `others` are the models that are passed over for this one.
+    `root` is the folder that holds the folder `masks`. `others` are the folders of the capture's other models, which are not used.
     """
 
     folder: Path
@@ -44,7 +44,9 @@ class Model(NamedTuple):
 
 
 def find_model(folder: Path) -> Model | None:
-    """Return the COLMAP model of a capture that has the most photos, or None if there is none. Of equal ones, the first in _MODELS counts.
+    """Find the COLMAP models of a capture. Return the one with the most photos, or None if there is none.
+
+    If several models have equally many photos, return the one whose folder comes first in _MODELS.
 
     `folder` is the capture's folder, or its subfolder `images_N` with reduced photos.
     """
@@ -84,13 +86,16 @@ def _sorted(top: Path, pattern: str) -> list[Path]:
 
 
 def _is_model(folder: Path, pattern: str) -> bool:
-    """Tell whether a folder has a model, of which in `sparse` a file may be missing: that is an error then."""
+    """Tell whether a folder, found by `pattern`, has a model: a file of cameras and a file of images.
+
+    In `sparse`, one of the two is enough. Reading the model then raises an error that names the missing file.
+    """
     there = [any((folder / f"{name}.{end}").is_file() for end in ("bin", "txt")) for name in ("cameras", "images")]
     return any(there) if pattern.startswith("sparse") else all(there)
 
 
 def _registered(model: Path) -> int:
-    """Count the photos of a model. A file that cannot be read has none: it is read only if there is no other."""
+    """Count the photos of a model. Return 0 if its file cannot be read, so that any other model is preferred."""
     try:
         return count_images(model_files(model)[1])
     except InputError:
@@ -125,7 +130,7 @@ def read_colmap(model: Model) -> tuple[list[View], np.ndarray | None, np.ndarray
 
 
 def _passed_over(model: Model, count: int) -> list[str]:
-    """Say which models are not used. Return no line if there is one model only. `count` are the photos of the one that is used."""
+    """Say in one line which models are not used. Return [] if there is only one. `count` is the number of photos of the model in use."""
     if not model.others:
         return []
     ours, first = (path.relative_to(model.root).as_posix() for path in (model.folder, model.others[0]))
@@ -140,7 +145,7 @@ def _find(photos: Files, name: str) -> Path | None:
 
 
 def capture_root(folder: Path, layout: str) -> Path:
-    """Return the folder in which the folder `masks` of a capture lies. `folder` and `layout` are the capture's."""
+    """Return the folder that holds the folder `masks` of a capture. `folder` is the capture's, `layout` its layout, such as "colmap"."""
     model = find_model(folder) if layout == "colmap" else None
     return folder if model is None else model.root
 

@@ -57,7 +57,11 @@ def without_mask_word(name: str) -> str:
 
 
 class _Listing(NamedTuple):
-    """Hold the names in a folder. `files` and `folders` map folded names to names; `stems` maps images' names without suffix."""
+    """Hold the names in a folder.
+
+    `files` and `folders` map each name's folded form (see `fold`) to the names that have it. `stems` does the same for the folded names of
+    images without suffix.
+    """
 
     files: dict[str, list[str]]
     stems: dict[str, list[str]]
@@ -78,10 +82,11 @@ class Files:
         self._owned: dict[Path, Path] = {}
 
     def find(self, name: str, *homes: str, suffixes: bool = True) -> Path | None:
-        """Return the file with a name, which is relative to the capture's folder, or None if it is missing.
+        """Return the file called `name`, a path relative to the capture's folder or an absolute path. Return None if it is missing.
 
-        `homes` are folders in which it is looked for next, such as "images". Of an absolute path that does not exist, ever shorter ends are
-        looked for in the capture's folder, at last the bare name there and in `homes`. Without `suffixes`, the name's suffix must be right.
+        `homes` are folders, such as "images", in which the name is looked for next. If an absolute path does not exist, its first folders
+        are dropped one by one, and the rest is looked for in the capture's folder. At last the bare file name is looked for in `homes`. If
+        `suffixes` is false, a file with another suffix than the name's is not returned.
         """
         for folder, last in self._places(name, homes):
             if (file := self._pick(folder, last, suffixes)) is not None:
@@ -111,14 +116,14 @@ class Files:
             yield from self.all_images(inner)
 
     def folders(self, folder: Path) -> list[Path]:
-        """List the folders in a folder, sorted. Hidden ones are left out, and what macOS adds to archives."""
+        """List the folders in a folder, sorted. Leave out hidden folders, and the __MACOSX that macOS adds to archives."""
         names = sorted(name for names in self._list(folder).folders.values() for name in names)
         inner = [folder / name for name in names if not name.startswith((".", "__MACOSX"))]
         real = os.path.join(os.path.realpath(folder), "")
         return [path for path in inner if not real.startswith(os.path.join(os.path.realpath(path), ""))]  # no circles
 
     def masks_beside(self, folder: Path) -> dict[str, str]:
-        """Return which images of a folder are masks of others, such as 0001_alpha.png, mapped to the photo's folded name without suffix."""
+        """Find masks that lie beside their photos, such as 0001_alpha.png. Returns {mask's name: photo's folded name without suffix}."""
         stems, masks = self._list(folder).stems, {}
         for name in (name for names in stems.values() for name in names if is_image(name)):
             of = without_mask_word(without_suffix(name))
@@ -146,7 +151,7 @@ class Files:
                 yield folder, parts[-1]
 
     def _own(self, folder: Path) -> Path:
-        """Return a folder's path as others inside the capture's folder have it, if it is in there."""
+        """If a folder lies in the capture's, also by a link, return its path below `self.folder`. Otherwise return it unchanged."""
         if folder not in self._owned:
             real, top = os.path.realpath(folder), os.path.realpath(self.folder)
             inside = real == top or real.startswith(os.path.join(top, ""))
@@ -188,7 +193,7 @@ def _preference(name: str) -> tuple[int, str]:
 
 
 def photo_folder(files: Files) -> Path:
-    """Return the folder of a capture's photos: its `images` or `input` if there are images in it or its folders, else its own."""
+    """Return the folder of a capture's photos: `images` or `input` if images are in it or below it, otherwise the capture's folder."""
     for name in PHOTO_FOLDERS:
         folder = files.find_folder(name)
         if folder is not None and next(files.all_images(folder), None) is not None:
@@ -208,7 +213,7 @@ def find_photos(folder: Path) -> list[Path]:
 
 
 def photos_in(files: Files, folder: Path, deep: bool) -> list[Path]:
-    """List the photos in a folder, with `deep` also in the folders in it, as `find_photos` does."""
+    """List the photos in a folder, by the rules of `find_photos`. If `deep` is true, also list those in its subfolders."""
     names, masks = files.images(folder), files.masks_beside(folder)
     pictures = {without_suffix(name) for name in names if name.lower().endswith(PICTURE_SUFFIXES)}
     found = [
@@ -221,10 +226,11 @@ def photos_in(files: Files, folder: Path, deep: bool) -> list[Path]:
 
 
 def leave_out_missing(source: Path, found: list[tuple[T, str, Path | None]]) -> tuple[list[tuple[T, Path]], list[str]]:
-    """Leave out photos that were removed, such as blurred ones. Return the others, and a list with a warning if any are missing.
+    """Leave out missing photos: the user may have removed blurred ones. Returns the others, and a list with a warning if any are missing.
 
-    `found` has, of each photo, anything to return with it, its name, and its file, which is None if the photo is missing. `source` is the
-    file or folder that names the photos. Raises InputError if more than half are missing: it is then another capture's, or was moved.
+    `found` has three things for each photo: anything that belongs to it, its name, and its file, or None if that is missing. The first
+    and the last are returned. `source` is the file or folder that names the photos. Raises InputError if more than half are missing: then
+    `source` belongs to another capture, or was moved.
     """
     missing = [name for _, name, file in found if file is None]
     if 2 * len(missing) > len(found):

@@ -102,7 +102,7 @@ _Step = Callable[[pickle.Unpickler], None]
 class _Arrays(pickle._Unpickler):
     """Read a pickle with only the classes and functions in `_NAMES`.
 
-    Python's reader is used, because a few bytes could make C's reader reserve gigabytes.
+    The reader written in Python is used. With the one written in C, a file of a few bytes could reserve gigabytes.
     """
 
     read: Callable[[int], bytes]  # `load` sets these two

@@ -20,8 +20,9 @@ def reduced(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Undistort a photo by `lens` and reduce it from the size of `camera` to that of `fitted`. Returns its codes and alpha.
 
-    `image` (H, W, 3) are sRGB codes, uint8 or uint16, in which `white` is the code of 1. `alpha` (H, W) is uint8 or None. Linear radiance
-    is averaged over each new pixel's area, weighted by alpha. The new alpha is None if `alpha` is; else fully transparent pixels are black.
+    `image` (H, W, 3) are sRGB codes, uint8 or uint16, in which `white` is the code of radiance 1. `alpha` (H, W) is uint8 or None. Linear
+    radiance is averaged over each new pixel's area, weighted by alpha. The new alpha is None if `alpha` is; else fully transparent pixels
+    are black.
     """
     size = fitted.height, fitted.width
     codes, opaque = np.empty((*size, 3), image.dtype), None if alpha is None else np.empty(size, np.uint8)
@@ -62,7 +63,7 @@ def reduced_map(values: np.ndarray, alpha: np.ndarray, camera: Camera) -> tuple[
 
 
 def encode(linear: np.ndarray, white: int) -> np.ndarray:
-    """Encode linear radiance to sRGB codes: 8-bit if `white`, the code of 1, is 255, else 16-bit."""
+    """Encode linear radiance to sRGB codes: 8-bit if `white`, the code of radiance 1, is 255, else 16-bit."""
     if white == 255:
         return np.rint(srgb_encode(np.clip(linear, 0, 1)) * 255).astype(np.uint8)
     bounded = np.clip(linear, 0, 1000)  # which is beyond every code
@@ -106,5 +107,5 @@ def _area_weights(rows: slice, source: slice, ratio: float) -> np.ndarray:
 
 @cache
 def _decoding_table(largest: int, white: int) -> np.ndarray:
-    """Return a table from the sRGB codes 0 to `largest` to linear radiance, float32. `white` is the code of 1."""
+    """Return a table from the sRGB codes 0 to `largest` to linear radiance, float32. `white` is the code of radiance 1."""
     return srgb_decode(np.arange(largest + 1) / white).astype(np.float32)

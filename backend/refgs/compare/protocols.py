@@ -59,7 +59,7 @@ def similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray, scaled: b
     """Measure how alike a rendering and a photo are, as Stanford-ORB does. Both are linear radiance (h, w, 3). Returns by name:
 
     - psnr_h: PSNR of radiance clipped at MOST_RADIANCE. Both are first multiplied by one factor: the mean of the sRGB-encoded photo divided
-      by the mean of the linear photo. The peak is 1 nevertheless.
+      by the mean of the linear photo. The PSNR's peak is 1, although MOST_RADIANCE is more.
     - psnr_l: PSNR of the pictures after clipping to 0..1 and sRGB encoding
     - ssim: SSIM of these encoded pictures, with a Gaussian window of 3×3 pixels and σ 1.5
     - lpips, only if the argument `lpips` is true: LPIPS (VGG-16) of these encoded pictures after a second sRGB encoding, as in

@@ -14,7 +14,8 @@ Seconds = Annotated[Finite, Field(ge=0)]
 class Facts(Model):
     """Hold everything in a checkpoint except its tensors.
 
-    `parts` maps the name of each `refgs.train.part.Part` to its facts. `clock` maps each part of an iteration to the seconds spent in it.
+    `parts` has the numbers and flags that each `refgs.train.part.Part` remembers, by the part's name. `clock` has the seconds
+    spent on each kind of work, such as shading, by its name.
     """
 
     iteration: Count

@@ -27,7 +27,7 @@ class Quantity(NamedTuple):
     decibels: bool = False
 
     def error(self, value: float) -> float:
-        """Return the error of a measured value, 1e300 at most."""
+        """Convert a value of history.jsonl to the error that curves show. A PSNR in dB becomes an RMS error, 1e300 at most."""
         return 10 ** (-max(value, -6000.0) / 20) if self.decibels else value
 
     def text(self, error: float) -> str:

@@ -4,7 +4,7 @@ It reads these files of a run folder. If a file is missing, its section is left 
 
     metrics.json     nested objects. Their numbers are metrics: those that `refgs.report.figures` names,
                      relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}, and any others.
-                     Texts are ambiguities.NAME.what and doubt.what.
+                     Texts are ambiguities.NAME.what and doubt.what: messages on what photos do not tell.
     history.jsonl    one object a line: seconds, iteration, parts (seconds by kind of work), and the errors that `refgs.report.curves` names
     needs.json       optional features that were kept or left out: a list of {"what", "why"}, with "saved", "cost", "needed" if known, and
                      "pictures" with and without the feature, in needs/

@@ -85,8 +85,8 @@ def _choose_light_frame(state: State, start: Parameters, on_hull: int) -> None:
 def _start_learning(state: State, start: Parameters) -> None:
     """Start learning the surfels, the light and the photos' exposures.
 
-    Surfels start with the parameters `start`. Two kinds of parameters are constant: those that do not affect this run's pictures, and those
-    that the rendering method sets.
+    Surfels start with the parameters `start`. Two kinds of parameters are not learned: those that do not affect this run's pictures,
+    and those that the rendering method fixes, as `reflection = mirror` fixes albedo.
     """
     settings, method = state.settings, state.method
     state.learned = Learned(state.capture.radius, method.light.brightest)
@@ -118,7 +118,7 @@ def _unused(state: State) -> list[str]:
 
 
 def start_residual(state: State, step: Step) -> None:
-    """Let the residual learn. It is a colour that changes with the direction, and explains what material and light do not."""
+    """Start to learn the residual: a view-dependent colour that explains what material and light do not."""
     state.residual = True
 
 

@@ -46,7 +46,7 @@ class Given(NamedTuple):
 
     - `done`: how many iterations are done.
     - `hidden`: the fraction of the object's pixels that mirror the object.
-    - `common`: each of "metallic" and "roughness" that is nearly equal for all surfels in splats.ply, with its value and its range's width.
+    - `common`: {"metallic" or "roughness": (common value, width of the range)}, for those nearly equal in all surfels of splats.ply.
     - `kept`: the number of surfels in splats.ply.
     """
 

@@ -51,7 +51,7 @@ def look_again(state: State, step: Step) -> None:
 
 
 def bring_back_specular(state: State, why: str) -> bool:
-    """Bring back specular shading and what was left out with it. `why` is the reason. Returns False if it is on, or off by a setting."""
+    """Bring back specular shading and what was left out with it, because of `why`. Returns False if it is on, or off by a setting."""
     if state.needed(SPECULAR.name) or SPECULAR.asked(state) != "auto":
         return False
     _bring_back_specular(state, Decision(True, why))

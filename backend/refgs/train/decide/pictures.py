@@ -68,9 +68,9 @@ def _specular(state: State, found: Found, views: list[int]) -> Iterator[tuple[Te
 
 
 def _reflections(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render each view twice. Where the object mirrors itself, it shows its mean radiance first, then the light behind it.
+    """Render each view twice. Mirror rays that hit the object get its mean radiance in the first picture, and the light in the second.
 
-    Both are guesses, because what the object mirrors of itself is not known before it is traced. Yields nothing without a mesh.
+    Both are guesses: what these rays see is not known before they are traced. Yields nothing without a mesh.
     """
     inputs = state.inputs()
     if inputs.occluder is None:

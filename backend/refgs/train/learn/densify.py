@@ -33,7 +33,7 @@ class Densification(Part):
         self.restart(state)
 
     def restart(self, state: State) -> None:
-        """Restart the mean, after surfels have been replaced."""
+        """Start new means of the screen gradients, all zero, after surfels have been replaced."""
         self.gradient = ScreenGradient(state.learned.count, state.device)
 
     def facts(self, state: State) -> dict[str, Fact]:

@@ -77,7 +77,7 @@ class Poses(Part):
 
 @torch.no_grad()
 def refine(state: State, step: Step) -> None:
-    """Move the pose of the view towards its photo. A step that is not finite is ignored."""
+    """Take one Gauss-Newton step with the pose of the view that this iteration trains on. Ignore a step that is not finite."""
     poses, photo = state.part(Poses), step.photo
     if poses.values is None:
         return
@@ -93,7 +93,7 @@ def refine(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def remove_common(state: State, step: Step) -> None:
-    """Remove the motion that all views share."""
+    """Subtract from all poses the motion that they share (see `_without_common`). It would only move or scale the whole scene."""
     poses = state.part(Poses)
     if poses.values is not None:
         poses.put(state, _without_common(state, poses.values))

@@ -32,7 +32,7 @@ CELL = 0.15  # side of a grid's cells, in scene radii: models are fitted to half
 
 
 class Explained(NamedTuple):
-    """Hold which fraction of the variance of a surface's changes each model explains. Models were fitted to other surfels.
+    """Hold which fraction of the variance of a surface's changes each model explains. The fraction is that of surfels left out of the fit.
 
     - `lit`: the light changes: for each photo, a linear function of the normal.
     - `mirrored`: the surface mirrors: one function of the mirror direction, and an exposure for each photo.
@@ -47,15 +47,15 @@ class Explained(NamedTuple):
 
     @property
     def by_changes(self) -> bool:
-        """Tell whether a light that changed explains clearly more than mirroring does, and mirroring explains hardly any of the rest.
+        """Tell whether the light changed: `lit` is clearly above `mirrored`, and mirroring explains hardly any of what `lit` leaves.
 
-        In a single photo of a mirror, the mirrored direction is a function of the normal, too, so `lit` alone tells nothing.
+        A high `lit` alone proves nothing: in a single photo, the mirror direction is nearly a function of the normal, too.
         """
         return self.lit - self.mirrored > CHANGED and self.both - self.lit < LEFT * (1 - self.lit)
 
     @property
     def by_mirroring(self) -> bool:
-        """Tell whether mirroring explains much, and the light did not change."""
+        """Tell whether the surface mirrors: `mirrored` is above NOISE, and the light did not change."""
         return self.mirrored > NOISE and not self.by_changes
 
     @property
@@ -82,9 +82,9 @@ def explained(observations: Observations, positions: Tensor, radius: float, *par
 
 
 def _explained(observations: Observations, relative: Tensor, known: Tensor, cells: Tensor) -> Explained:
-    """Fit both models to the changes `relative` (N, V) where they are `known` (N, V), and measure what they explain.
+    """Fit the models to the changes `relative` (N, V) where they are `known` (N, V), and measure what they explain.
 
-    Changes are relative to the mean radiance. `cells` (N, 3) are positions in units of the grid's cells.
+    Changes are divided by the surfel's mean radiance. `cells` (N, 3) are positions in grid cells. The fit uses every second cell.
     """
     chosen = known.any(dim=1).nonzero()[:, 0]
     if len(chosen) < LEAST_SURFELS:
