@@ -66,7 +66,7 @@ def read_rows(folder: Path) -> list[Row]:
 def _inside(folder: Path, path: str, suffix: str) -> str:
     """Return a path that a table names, or "" if it is not a file with this suffix in the batch's folder.
 
-    The panel opens the file with the program that the system has for it. Of a program, that would run it.
+    The panel opens the file with the system's default program. Without this check, a damaged table could make it run any program.
     """
     inside = os.path.realpath(path).startswith(os.path.realpath(folder) + os.sep)
     return path if inside and path.endswith(suffix) and os.path.isfile(path) else ""

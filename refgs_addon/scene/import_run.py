@@ -128,8 +128,8 @@ def put_under(meshes: list[bpy.types.Object], splats: bpy.types.Object) -> None:
 def trace_rays(scene: bpy.types.Scene) -> None:
     """Make a scene fit for a run: switch on Eevee's ray tracing, and let rays in Cycles pass at least LAYERS transparent quads.
 
-    The object then mirrors and darkens itself in Eevee, too. Eevee traces a ray for each pixel and does not denoise: half the resolution
-    makes chrome and glossy paint look dull, and so does Blender's denoising. If ray tracing is already on, its options stay.
+    The object then mirrors and darkens itself in Eevee, too. Rays are traced at full resolution and not denoised, because half the
+    resolution and Blender's denoising both make chrome and glossy paint look dull. If ray tracing is already on, its options stay.
     """
     if not scene.eevee.use_raytracing:
         scene.eevee.use_raytracing = True
@@ -175,7 +175,7 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
 
 
 def _check_self_contained(path: Path) -> None:
-    """Raise InputError if a GLB names other files: Blender's importer would read any file of the computer that a run names.
+    """Raise InputError if a GLB names other files. Otherwise Blender's importer would read them, wherever on the computer they are.
 
     A GLB has a header of 12 bytes, then the length and the kind of a JSON chunk, then the chunk (glTF 2.0 specification).
     """

@@ -25,9 +25,10 @@ def check_pixels(path: Path, width: int, height: int, small: int = SMALL, per_by
 
 
 def check_photo(path: Path, width: int, height: int) -> None:
-    """Raise InputError if a file would take far more memory or time to decode than any photo of its size.
+    """Raise InputError if decoding a file would take far more memory or time than a real photo with as many bytes.
 
-    Masks are not checked by this function, because they may be of one colour.
+    `width` and `height` are the picture's declared size in pixels. Do not check masks with this function: a mask may be of one colour, so
+    that many pixels fit into few bytes.
     """
     check_pixels(path, width, height, per_byte=PHOTO_PER_BYTE)
     with open(path, "rb") as file:
