@@ -79,7 +79,7 @@ class Train(_Command):
     hints: str | None = None
 
     def asked(self) -> Asked:
-        """Return what the command asks for. Raises InputError if its options are wrong or do not fit together."""
+        """Return the command's options as an `Asked`. Raises InputError if they are wrong or do not fit together."""
         run, hints = (Path(path) if path else None for path in (self.run, self.hints))
         changes = tuple(self.settings)
         return Asked(
@@ -138,7 +138,7 @@ class Refused:
 
 
 def read_command(line: bytes) -> _Command | Refused:
-    """Parse a line of the input."""
+    """Parse a line of the input. Returns its command, or a `Refused` that says why it is no valid command."""
     job = None
     try:
         message = json.loads(line.decode())  # pydantic's parser refuses lone surrogates: names of folders hold them
@@ -209,8 +209,8 @@ class Worker:
     def send(self, event: str, facts: dict[str, Any]) -> None:
         """Write an event to the output as a JSON line.
 
-        If nobody reads the output any more, writing fails. Then jobs are ended as when the input ends, unless a `Keep` command with `on` =
-        True has come. The message `what` is written as one line.
+        If `facts` has a message `what`, its newlines are escaped. If nobody reads the output any more, writing fails. Jobs are then ended
+        as when the input ends, unless a `Keep` command with `on` = True has come.
         """
         if "what" in facts:
             facts = facts | {"what": one_line(facts["what"])}

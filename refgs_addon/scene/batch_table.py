@@ -64,7 +64,7 @@ def read_rows(folder: Path) -> list[Row]:
 def _inside(folder: Path, path: object, endings: tuple[str, ...]) -> str:
     """Return the path of a file if it is one in the batch's folder, with one of these endings, otherwise "".
 
-    The system opens what the panel shows. A table that came with a folder must not choose a program for that.
+    The panel opens the file with the system's default program. Without this check, a damaged table could make it run any program.
     """
     file = Path(str(path or "")).resolve()
     known = file.is_relative_to(folder.resolve()) and file.suffix.lower() in endings and file.is_file()

@@ -132,8 +132,8 @@ def put_under(meshes: list[bpy.types.Object], splats: bpy.types.Object) -> None:
 def trace_rays(scene: bpy.types.Scene) -> None:
     """Make a scene fit for a run: switch on Eevee's ray tracing, and let rays in Cycles pass at least LAYERS transparent quads.
 
-    The object then mirrors and darkens itself in Eevee, too. Eevee traces a ray for each pixel and does not denoise: half the resolution
-    makes chrome and glossy paint look dull, and so does Blender's denoising. If ray tracing is already on, its options stay.
+    The object then mirrors and darkens itself in Eevee, too. Rays are traced at full resolution and not denoised, because half the
+    resolution and Blender's denoising both make chrome and glossy paint look dull. If ray tracing is already on, its options stay.
     """
     if not scene.eevee.use_raytracing:
         scene.eevee.use_raytracing = True

@@ -93,8 +93,8 @@ def make_masks(scene: bpy.types.Scene) -> jobs.Job:
 def _show_masks(number: int, capture: Path, found: dict) -> None:
     """Show masks that were just made: on canvases of strokes, and as the box around the object.
 
-    A box that the artist placed is not replaced. It moves as the new masks move the capture's frame. `found` is the trainer's result of
-    making masks. `number` is the scene's `session_uid`.
+    A box that the artist placed is not replaced. The new masks may move the capture's frame; the box is then moved along. `found` is the
+    trainer's result of making masks. `number` is the scene's `session_uid`.
     """
     strokes.show_masks(capture)
     if known := _scene(number):

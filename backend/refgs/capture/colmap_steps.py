@@ -193,8 +193,8 @@ def map_one_by_one(photos: list[Path], database: Path, progress: Callable) -> li
 def map_at_once(photos: list[Path], database: Path) -> list[Any]:
     """Compute all cameras together (GLOMAP). Return the models as `map_one_by_one` does.
 
-    GLOMAP also links photos that share too little to be placed one after the other. It places some photos by their direction alone, without
-    points that several photos show. Their distance is not known, so this function removes their cameras.
+    GLOMAP also links photos that share too little to be placed one after the other. For some photos it only finds the direction from other
+    photos, but not the distance, because they share too few points with them. This function removes the cameras of these photos.
     """
     import pycolmap
 
@@ -210,10 +210,10 @@ def map_at_once(photos: list[Path], database: Path) -> list[Any]:
 
 
 def _tied(model: Any) -> set[int]:
-    """Return the largest set of a model's images that are tied by common points. It grows from the two images that share most points.
+    """Return the numbers of a model's images that are tied together by common points.
 
-    An image is tied if it shows TIED points that two tied images show. Otherwise its distance is not known, because the relative pose of
-    two photos has no scale.
+    The first two tied images are those that share most points. Another image is tied if it shows at least TIED points, each of which at
+    least two tied images show. The distance of an image that is not tied is unknown, because the relative pose of two photos has no scale.
     """
     shown = {
         number: {seen.point3D_id for seen in model.image(number).get_observation_points2D()}
@@ -251,7 +251,8 @@ def unexplained_part(model: Any, database: Path) -> float:
     """Return the fraction of feature matches that the cameras of a model (a pycolmap.Reconstruction) do not explain.
 
     A match is explained if both its photos have cameras, and its points are at most MATCH_TOLERANCE pixels from their epipolar lines.
-    Photos without cameras matter if an object turns before a still room: photos that follow the room may get no camera.
+    Matches of photos without cameras count as unexplained. If an object turns in a room that stands still, cameras may be found for the
+    photos that agree with the object's motion, but not for those that agree with the room's.
     """
     import pycolmap
 

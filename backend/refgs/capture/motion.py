@@ -55,10 +55,11 @@ WITH_MASKS = (
 
 
 class _Found(NamedTuple):
-    """Hold the photos that got a camera, the mean reprojection error in pixels, and reasons to doubt the cameras.
+    """Hold what COLMAP found: which photos got a camera, the mean reprojection `error` in pixels, and reasons to doubt the cameras.
 
-    `unexplained` is the fraction of feature matches that the cameras do not explain. `apart` are the names of the photos in the largest
-    other group: these photos fit together, but not to the placed ones. `inside` says that only the pixels inside the masks were used.
+    `placed` are the photos that got a camera. `unexplained` is the fraction of feature matches that the cameras do not explain. `apart` is
+    the largest group of photos whose cameras fit together, but not to the cameras of `placed`. `inside` is true if only the pixels inside
+    the masks were used.
     """
 
     placed: set[Path]
@@ -71,11 +72,11 @@ class _Found(NamedTuple):
 def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) -> dict[str, Any]:
     """Find the cameras of the photos that `find_photos` lists. Write them to the folder's subfolder `sparse/0` as a COLMAP model.
 
-    If these cameras leave much unexplained or there are hardly any, and all photos have masks, cameras are found anew from the pixels
-    inside the masks. This is the way for an object on a turntable.
+    The whole photos are used first. The cameras are then found anew from the pixels inside the masks, if all photos have masks, and too few
+    photos got a camera or the cameras leave many feature matches unexplained. An object on a turntable needs this.
 
-    Returns a dict: `photos` is their number, `placed` is how many got a camera, `error` is the mean reprojection error in pixels, and
-    `inside` is whether only the pixels inside the masks were used.
+    Returns a dict: `photos` is the number of photos, `placed` is how many of them got a camera, `error` is the mean reprojection error in
+    pixels, and `inside` is true if only the pixels inside the masks were used.
 
     `report(event, facts)` is called with "progress" and a dict of `stage` ("features", "matching" or "mapping"), `done` and `total`, or
     with "warning" and a dict with the text `what`.
@@ -143,7 +144,7 @@ def _remove(path: Path) -> None:
 
 
 def _enough(placed: set[Path], photos: list[Path]) -> bool:
-    """Return whether enough photos got a camera to make a capture of them."""
+    """Tell whether enough photos got a camera: at least three, and at least half of `photos`. `placed` are the photos with a camera."""
     return len(placed) >= max(3, len(photos) / 2)
 
 

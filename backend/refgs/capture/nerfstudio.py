@@ -21,7 +21,8 @@ from refgs.formats.transforms import Frame, read_transforms
 def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None, list[str]]:
     """Read a nerfstudio or instant-ngp capture. Return its views, its points (M, 3), their colours (M, 3) in 0..1, and warnings.
 
-    Everything is in the capture's coordinates. Points and colours are None if the capture names no file of points. Raises InputError.
+    Cameras and points are in the capture's coordinates. Points and colours are None if the capture names no file of points. Raises
+    InputError.
     """
     file = folder / "transforms.json"
     found = read_transforms(file)

@@ -49,8 +49,9 @@ def read_raw_header(path: Path) -> tuple[int, int, int]:
 def read_raw(path: Path, half: bool = False) -> np.ndarray:
     """Read a RAW photo as linear radiance (H, W, 3) uint16, not turned upright. A value is WHITE where the sensor is saturated.
 
-    With `half`, each 2×2 sensor pixels make one pixel, which needs no interpolation. All photos of a camera have the same scale: a value
-    depends on the light and the exposure alone, not on what else is in the photo. Raises InputError naming the file.
+    With `half`, a square of 2×2 sensor pixels makes one pixel of the result, so that no colour needs to be interpolated. All photos of a
+    camera have the same scale: a pixel's value depends on its light and the exposure, not on the other pixels. Raises InputError naming
+    the file.
     """
     with _reading(path), rawpy.imread(str(path)) as raw:
         linear = raw.postprocess(

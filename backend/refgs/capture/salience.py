@@ -27,10 +27,10 @@ MEAN, DEVIATION = (
 class SalienceModel:
     """Model of salient-object segmentation, such as U²-Net, IS-Net or BiRefNet, on the CPU.
 
-    Its input is (1, 3, height, width) float32 RGB, normalised as for ImageNet. Its first output is one map. If a value is negative, the
-    values are taken for logits. Otherwise, if a value is greater than 1, the values are scaled to 0..1. Otherwise they are probabilities.
-    `side` is the longer side of the input, in pixels. Raises InputError if the file is missing, damaged or another type of model, or if
-    ONNX Runtime is not installed.
+    The model's input is a photo (1, 3, height, width) float32 RGB, normalised as for ImageNet. Its first output is one number for each
+    pixel. If any of these numbers is negative, all are taken for logits. If none is negative but one is greater than 1, all are scaled to
+    0..1. Otherwise they are taken for probabilities. `side` is the longer side of the input, in pixels. Raises InputError if the file is
+    missing, damaged or another type of model, or if ONNX Runtime is not installed.
     """
 
     def __init__(self, file: Path):

@@ -21,9 +21,9 @@ def similar_pairs(read: Callable[[int], np.ndarray], count: int, beside: int) ->
     """Pair each of `count` photos with others that look like it. Return pairs of indices, the smaller one first.
 
     `read(index)` returns the descriptors of a photo's features, (M, D) of any dtype. It is called twice for each photo. Photos at most
-    `beside` places from each other are not paired. The others are ranked by likeness, and those at the RANKS are chosen. These ranks have
-    gaps: among many photos, the most similar ones are all neighbours, and photos of other rounds around the object would not be chosen. The
-    same photos always give the same pairs.
+    `beside` places from each other are not paired. The other photos are sorted by likeness, the most similar first. Each photo is paired
+    with those at the places RANKS in this order. RANKS has gaps: among many photos, the most similar ones were all taken from nearby, so
+    that photos from other rounds around the object come later in the order. The same photos always give the same pairs.
     """
     random = np.random.default_rng(0)
     sample = np.concatenate([random.permutation(read(index))[:SAMPLE] for index in range(count)])
@@ -46,7 +46,10 @@ def _unit(rows: np.ndarray) -> np.ndarray:
 
 
 def _describe(features: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Return the unit vector (WORDS · D,) that describes a photo with these features (M, D). It is zero if there are no features."""
+    """Return the VLAD vector (WORDS · D,) of a photo, from its features (M, D) and all photos' `means` (WORDS, D).
+
+    The vector has length 1. It is zero if the photo has no features.
+    """
     word = np.argmax(features @ means.T - (means**2).sum(axis=1) / 2, axis=1)
     sums = np.zeros_like(means)
     np.add.at(sums, word, features - means[word])

@@ -28,7 +28,7 @@ def read_stanford_orb(folder: Path) -> tuple[list[View], list[str]]:
 
 
 def novel_views(folder: Path) -> list[tuple[str, View]]:
-    """Read the photos of the same object in other scenes, each with the name of its scene. Those not on disk are left out.
+    """Read the photos of the same object in other scenes. Return pairs of a scene's name and a view. Scenes not on disk are left out.
 
     The cameras are in the coordinates of the capture in `folder`. Raises InputError.
     """

@@ -105,7 +105,7 @@ def _signed_distance(alpha: np.ndarray) -> np.ndarray:
 
 
 def _look_up(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Read the values of a picture that was enlarged UPSAMPLING times. The positions `x` and `y` are in pixels of the original."""
+    """Look up values in a `picture` that was enlarged UPSAMPLING times, at positions `x` and `y` in pixels of the original picture."""
     row, column = ((UPSAMPLING * v).astype(int) for v in (y, x))
     return picture[row.clip(0, len(picture) - 1), column.clip(0, picture.shape[1] - 1)]
 
@@ -113,8 +113,9 @@ def _look_up(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _gaps(mesh: Mesh, camera: Camera, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Measure the gap between two outlines: the mesh's, and the object's in a rendering.
 
-    Returns, for each pixel on the mesh's outline, the index of a vertex there, and the gap in world units. A gap is positive if the mesh's
-    outline lies inside the object's, and negative if outside. `distance` is the result of `_signed_distance` for the rendering.
+    Returns two arrays with one entry for each pixel on the mesh's outline: the index of a vertex near the pixel, and the gap there in world
+    units. A gap is positive if the mesh's outline lies inside the object's, and negative if outside. `distance` is the result of
+    `_signed_distance` for the rendering.
     """
     scene = EmbreeScene()  # rays are traced in single precision about the mesh's middle
     middle = mesh.vertices.mean(axis=0)

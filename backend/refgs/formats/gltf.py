@@ -101,8 +101,8 @@ def read_glb(path: str | os.PathLike) -> Mesh:
 def _check_self_contained(data: bytes) -> None:
     """Raise ValueError if a binary glTF file names other files, or declares more numbers than it has bytes.
 
-    Its numbers then could come from any file of the computer, or take any amount of memory. `data` is the file's content (glTF 2.0
-    specification, "GLB File Format": a header of 12 bytes, then the length and the kind of the JSON chunk).
+    Without this check, reading the file could read any other file of the computer, or take any amount of memory. `data` is the file's
+    content: a header of 12 bytes, then the length and the kind of the JSON chunk, then that chunk (glTF 2.0, "GLB File Format").
     """
     length, kind = struct.unpack_from("<I4s", data, 12)
     if kind != b"JSON":

@@ -198,7 +198,10 @@ def read_splats(path: str | os.PathLike) -> Splats:
         return structured_to_unstructured(repack_fields(part) if rows.dtype.hasobject else part, np.float32, copy=True)
 
     def harmonics(prefix: str, *counts: int) -> np.ndarray:
-        """Read the columns PREFIX0, PREFIX1 … as harmonics (N, K, 3). Raises InputError if their number is not in `counts`."""
+        """Read the columns PREFIX0, PREFIX1 … as harmonics (N, K, 3).
+
+        Raises InputError if a column is missing, or if the number of columns, 3·K, is not in `counts`.
+        """
         found = sum(re.fullmatch(rf"{prefix}\d+", name) is not None for name in names)
         wanted = [f"{prefix}{i}" for i in range(found)]
         if found not in counts or not {*wanted} <= {*names}:

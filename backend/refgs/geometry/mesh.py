@@ -16,9 +16,9 @@ def clean(mesh: Mesh, triangles: int) -> SmoothMesh:
     """Clean up a mesh, simplify it to about `triangles` faces if it has more, and compute smooth normals.
 
     - Crumbs are removed: connected parts with less than KEEP times the largest part's area.
-    - Holes of at most HOLE edges are closed. They are no holes of the object: only photos of the surface are missing there.
-    - Frays are removed: strips at a border of the surface in which no vertex is FRAY faces away from the border. A closed surface has no
-      border, however thin it is.
+    - Holes of at most HOLE edges are closed. The object has no holes there; the surface is missing because no photo shows it.
+    - Frays are removed: parts of the surface, such as strips, that are so narrow that all their vertices are less than FRAY faces from the
+      border. Thin parts of a closed surface stay, because it has no border.
 
     Simplification is by quadric error (Garland and Heckbert 1997). In the returned mesh, no edge has more than two faces. Faces keep their
     winding. Raises InputError if the mesh has no valid face.

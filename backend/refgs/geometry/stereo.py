@@ -34,7 +34,7 @@ BISECTIONS = 3  # of the step between two planes
 
 
 class Photo(NamedTuple):
-    """Hold a photo: `image` (H, W, 3), in which the value `white` means 1, its mask `alpha` (H, W) uint8, and its camera."""
+    """Hold a photo: `image` (H, W, 3), its mask `alpha` (H, W) uint8, its camera, and `white`, the value of a white pixel in `image`."""
 
     image: np.ndarray
     alpha: np.ndarray
@@ -61,7 +61,7 @@ class Shape:
         return (first + last) / 2, float(np.linalg.norm(last - first)) / 2
 
     def fit(self, camera: Camera, across: int) -> Camera:
-        """Return the camera of a picture reduced until the shape's ball is `across` pixels wide. Smaller pictures stay as they are."""
+        """Return the camera for a picture so reduced that the shape's ball is `across` pixels wide. A picture is never enlarged."""
         centre, radius = self.ball
         distance = float(np.linalg.norm(camera.position - centre))
         side = across * max(camera.width, camera.height) * distance / (2 * radius * camera.fx)
@@ -132,9 +132,10 @@ def _reduced(photo: Photo, shape: Shape) -> _Reduced:
 
 
 def _neighbours(cameras: list[Camera], centre: np.ndarray) -> list[np.ndarray]:
-    """Choose at most NEIGHBOURS neighbours for each camera. Returns arrays of their indices, the nearest first.
+    """Choose at most NEIGHBOURS neighbours for each camera. Returns an array of indices for each camera, the nearest neighbour first.
 
-    Distances are angles seen from `centre`, in degrees. They must lie between ANGLES[0] and ANGLES[1].
+    The distance of two cameras is the angle between them in degrees, seen from `centre`. It lies between ANGLES[0] and ANGLES[1] for
+    neighbours.
     """
     towards = np.stack([camera.position for camera in cameras]) - centre
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
@@ -144,9 +145,10 @@ def _neighbours(cameras: list[Camera], centre: np.ndarray) -> list[np.ndarray]:
 
 
 def _sweep(photo: _Reduced, others: list[_Reduced], shape: Shape, unsure: np.ndarray) -> DepthMap:
-    """Find the depth of each pixel: that of the plane on which the photo looks most like `others`.
+    """Find the depth of each pixel of a photo, by comparing the photo with `others` on planes at many depths.
 
-    Only planes inside the shape are tried: those where the pixel's ray meets a plane in a solid voxel. `unsure` is as in `depth_maps`.
+    A pixel gets the depth of the plane on which the photo looks most like `others`. A plane counts only if the pixel's ray meets it near or
+    in a solid voxel of `shape`. `unsure` is as in `depth_maps`.
     """
     camera, (centre, radius) = photo.camera, shape.ball
     middle = float(camera.world_to_camera[2, :3] @ centre + camera.world_to_camera[2, 3])
@@ -172,7 +174,10 @@ def _sweep(photo: _Reduced, others: list[_Reduced], shape: Shape, unsure: np.nda
 
 
 def _entry(camera: Camera, rays: np.ndarray, planes: np.ndarray, within: np.ndarray, shape: Shape) -> np.ndarray:
-    """Return the points (N, 3) at which rays enter a shape. `within` (P, N) tells which of the rays' points on P planes lie in it."""
+    """Return the points (N, 3) at which N rays of a camera enter a shape.
+
+    `planes` are the depths of P planes. `within` (P, N) is true where the point at which a ray meets a plane lies in the shape.
+    """
     first = within.argmax(axis=0)
     before, after = planes[np.maximum(first - 1, 0)], planes[first]
     for _ in range(BISECTIONS):
@@ -185,9 +190,9 @@ def _entry(camera: Camera, rays: np.ndarray, planes: np.ndarray, within: np.ndar
 def _scores(
     photo: _Reduced, others: list[_Reduced], planes: np.ndarray, rows: np.ndarray, columns: np.ndarray
 ) -> np.ndarray:
-    """Compare a photo with the others, moved onto planes that face its camera.
+    """Compare a photo with the `others`, projected onto planes at P depths that face its camera.
 
-    Returns the mean correlation (P, N) with the BEST most similar photos, in each of N pixels on each of P planes.
+    Returns an array (P, N) for the N pixels at `rows` and `columns`. Each value is the mean of the BEST largest correlations with `others`.
     """
 
     def mean(picture: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from refgs.model import cubemap, harmonics, prefilter
 
 
 def turn_between(camera: Camera, reference: Camera) -> np.ndarray:
-    """Return the rotation (3, 3) about the world's z axis that turns the heading of `camera` to the heading of `reference`."""
+    """Return the rotation (3, 3) about the world's z axis that turns the heading (compass direction) of `camera` to that of `reference`."""
     angle = reference.heading - camera.heading
     sine, cosine = math.sin(angle), math.cos(angle)
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])

@@ -37,11 +37,12 @@ def posed(camera: Camera, pose: Tensor, centre: np.ndarray, radius: float) -> Ca
 def pose_step(
     rendering: Rendering, photo: Tensor, camera: Camera, centre: np.ndarray, radius: float, reduction: int = 1
 ) -> Tensor:
-    """Compute the pose (6,) that moves the rendering of `camera` towards the photo (H, W, 3), sRGB-encoded. Zero if nothing is shown.
+    """Compute the pose (6,) that moves the rendering of `camera` towards the photo (H, W, 3). Return zeros if the rendering is empty.
 
-    The pose minimises Σ w |photo − picture + ∇ · motion(pose)|² over the pixels and channels, where picture is the rendering. ∇ is the mean
-    of the gradients of picture and photo, by central differences. This mean converges faster than one gradient (Benhimane and Malis 2004).
-    The weight w is small where picture and photo differ much.
+    The photo and the rendering's picture are sRGB-encoded. Both are first reduced by the factor `reduction`. The pose minimises
+    Σ w |photo − picture + ∇ · motion(pose)|² over the pixels and channels. motion(pose) is how far the pose moves a pixel. ∇ is the mean of
+    the gradients of picture and photo, by central differences. With this mean, the steps converge faster than with the gradient of one of
+    them (Benhimane and Malis 2004). The weight w is small where picture and photo differ much.
     """
     maps = [rendering.color.clamp(0, 1), photo, rendering.blended_depth[..., None], rendering.alpha[..., None]]
     color, photo, depths, alpha = (_reduced(value, reduction) for value in maps)
@@ -68,9 +69,11 @@ def pose_step(
 def _normal_equations(
     rows: Tensor, columns: Tensor, maps: tuple[Tensor, ...], camera: Camera, centre: np.ndarray, radius: float
 ) -> tuple[Tensor, Tensor]:
-    """Sum the normal equations of a pose (6, 6) and (6,), float64, over the pixels at these rows and columns.
+    """Return the matrix (6, 6) and the right side (6,) of a pose's normal equations, in float64.
 
-    `maps` are the gradients of the picture to the right and down (H, W, 3), the differences from the photo (H, W, 3), and the depth (H, W).
+    Both are sums over the pixels at `rows` and `columns`.
+    `maps` holds four maps: the gradient of the picture to the right and the one down (H, W, 3), the difference photo − picture (H, W, 3),
+    and the depth (H, W).
     """
     across, down, apart, depth = (value[rows, columns].double() for value in maps)
     x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
@@ -97,9 +100,9 @@ def _normal_equations(
 def fitted(
     picture: Callable[[Camera], Rendering], camera: Camera, photo: Tensor, centre: np.ndarray, radius: float
 ) -> Camera:
-    """Move a camera by a few steps so that its picture fits the photo better. Nothing else changes.
+    """Move a camera in steps so that its rendering, `picture(camera)`, fits the photo better. Change only the camera's pose.
 
-    Returns the camera with the smallest squared error found, which may be `camera` itself.
+    Returns the camera of the step with the smallest squared error, which may be `camera` itself.
     """
     best, least, now = camera, np.inf, camera
     for reduction in [*np.repeat(REDUCTIONS, STEPS).tolist(), 1]:

@@ -93,7 +93,8 @@ class Method:
     - `draw`: a function that replaces deferred shading; it takes the arguments of `render`. None keeps deferred shading.
     - `unread`: names of the surfels' parameters that do not affect pictures. They are not trained.
     - `constants`: parameters that have the same raw value for all surfels, {name: value}. They are not trained.
-    - `left_out`: the features of RefGS that the method lacks. Each is an entry of needs.json: "what" is left out, "why", what is "saved".
+    - `left_out`: the features of RefGS that the method lacks, as entries of needs.json. An entry has three texts: "what" is left out, "why"
+      it is, and what that has "saved".
     """
 
     lit: bool = True

@@ -47,9 +47,9 @@ def measure(
 def _tensoir(
     run: Run, cameras: list[Camera], truth: TensoIRTruth, pictures: Path, next_step: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Measure as TensoIR does: normals and base colour over whole pictures, and relit pictures with base colour corrected.
+    """Measure as TensoIR does: normals and base colour over whole pictures, and pictures under other lights.
 
-    The correction of base colour is one factor a channel, `ratio`.
+    If the true base colours are known, the run's are first corrected by one factor for each channel, the result's `ratio`.
     """
     found: dict[str, Any] = {}
     places = np.linspace(0, len(cameras) - 1, min(len(cameras), RATIO_VIEWS)).round().astype(int)
@@ -116,8 +116,9 @@ def _relit_as_tensoir(
 def _stanford_orb(
     run: Run, views: list[View], truth: StanfordORBTruth, pictures: Path, next_step: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Measure as Stanford-ORB does: test views (`view`), the object in other scenes under their light (`light`), normals and depth.
+    """Measure as Stanford-ORB does: the test views, photos of the object in other scenes, normals and depth.
 
+    In the result, `view` holds the metrics of the test views, and `light` those of the other scenes, rendered under those scenes' lights.
     PSNR-H, the PSNR of linear radiance, is left out for photos that are not EXR files.
     """
     with_lpips, found = metrics.lpips_missing() is None, {}

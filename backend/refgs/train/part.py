@@ -11,10 +11,10 @@ Fact = bool | int | Tensor
 
 
 class Part:
-    """Remember what one part of a training has found. `state.part(Kind)` returns the part of this kind.
+    """Hold the memory of one task of a training, such as aligning poses. `state.part(Kind)` returns the part of the class `Kind`.
 
     `train/timeline.py` says when each part acts. A checkpoint stores the part's `facts` under its `name`: numbers in the TOML file, and
-    tensors. By default, the facts are the attributes in `saved` that are not None.
+    tensors. By default, the facts are the attributes named in `saved` that are not None.
     """
 
     name: ClassVar[str]

@@ -207,10 +207,10 @@ class Trainer:
             trim()  # free the memory that decisions took
 
     def _check(self, whole: bool) -> None:
-        """Check that the training's numbers are finite. If `Guard.look` returns a reason, go back to the last checkpoint, and warn.
+        """Let `Guard.look` look for values that are not finite. If it returns a reason, go back to the last checkpoint, and warn.
 
-        The time spent since that checkpoint still counts as training time. `whole` is passed on to `Guard.look`: if true, surfels are
-        checked even if no step was skipped.
+        The time spent since that checkpoint still counts as training time. If `whole` is true, surfels are checked even if no step was
+        skipped.
         """
         state = self.state
         if why := self.guard.look(state, whole, lambda: checkpoint.complete(state.folder / CHECKPOINTS)):

@@ -37,8 +37,8 @@ class Reflections(Need):
         """Decide by two measurements whether inter-reflection is needed.
 
         The first is `given.hidden`, the fraction of the object's pixels that mirror the object itself. The second is how many dB
-        inter-reflection can gain at most. Both must reach their thresholds: either those for the whole object, or those for a small part of
-        it. Nothing is measured if the user's setting is "off".
+        inter-reflection can gain at most. Inter-reflection is needed if both reach their thresholds over the whole object. If a small part
+        gains much, a smaller fraction suffices. Nothing is measured if the user's setting is "off".
         """
         if self.asked(state) == "off":
             return Decision(False, ASKED)

@@ -19,7 +19,7 @@ RENAMED = {
 def as_of_today(tensors: dict[str, Tensor], facts: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Return the tensors and facts of a checkpoint in today's form.
 
-    Release 0.1.0 marked held surfels by the value of their metallic, and stored each part's facts as separate top-level keys.
+    In release 0.1.0, a metallic with a special value (HELD) marked a surfel as held. The facts of each `Part` had top-level keys.
     """
     if "residual" in facts:
         return tensors, facts

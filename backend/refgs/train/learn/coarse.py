@@ -44,7 +44,7 @@ def stages(pixels: float) -> tuple[Stage, ...]:
 def begin(state: State, pixels: float, refined: bool) -> None:
     """Choose the stages of a training whose object has a span of `pixels` in the full photos, and start with the first one.
 
-    If poses are `refined`, photos are full from POSES_KNOWN on: the progress at which poses are judged.
+    If poses are `refined`, full photos are used from the progress POSES_KNOWN on, because poses are judged at that time.
     """
     if state.settings.image.coarse == "off":
         return

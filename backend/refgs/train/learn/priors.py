@@ -145,8 +145,8 @@ def at_pixels(values: Tensor, camera: Camera, pixels: Camera) -> Tensor:
 def fitted(guessed: Tensor, depth: Tensor, counts: Tensor, disparity: bool, radius: float) -> tuple[Tensor, Tensor]:
     """Scale and shift guessed depth or disparity (H, W) to fit `depth` (H, W) best, by robust least squares.
 
-    Pixels are weighted by `counts`, and by less the farther they are from the fit (Cauchy's weights, at FAR scene radii). Returns the
-    fitted depth (H, W), and a scalar: 1 if the fitted scale is positive, else 0. `depth` must be detached.
+    A pixel's weight is its value in `counts`, times a Cauchy weight: 1/2 where the fit is FAR scene radii from `depth`. Returns the fitted
+    depth (H, W), and a scalar: 1 if the fitted scale is positive, else 0. `depth` must be detached.
     """
     wanted = 1 / depth.clamp_min(1e-6 * radius) if disparity else depth
     weight, found, slope = counts, depth, counts
@@ -185,7 +185,7 @@ def axes_of(pairs: Iterable[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor | No
 
 
 def _with_axes(state: State, normals: Maps) -> Maps:
-    """Return the maps of normals in the axes of their cameras, or none if it is not clear which axes they have."""
+    """Turn the maps of normals to the axes of their cameras. Return {} if their own axes cannot be told from the surfels' normals."""
     if not normals:
         return {}
     turn = split_similarity(state.capture.to_capture)[1]
@@ -227,7 +227,7 @@ def _with_axes(state: State, normals: Maps) -> Maps:
 def _near_outline(photo: Photo) -> Tensor:
     """Tell which pixels (H, W) lie just inside the outline of a photo's mask.
 
-    Just inside, the visual hull has the surface's normals, even if elsewhere its lid covers a bowl.
+    There the visual hull has the surface's normals. Farther inside it may not: over a bowl, the hull has a lid.
     """
     if photo.mask is None:
         return torch.zeros(photo.image.shape[:2], dtype=torch.bool, device=photo.image.device)

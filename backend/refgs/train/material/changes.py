@@ -35,12 +35,11 @@ METAL_TINT = 0.6  # tint of the change (0: grey as a dielectric's reflection; 1:
 
 
 class Shining(NamedTuple):
-    """Mark the surfels whose radiance changes with the view as that of a coloured metal. Each field is a bool mask (N,).
+    """Hold three bool masks (N,) about surfels that look like a coloured metal: their radiance changes from view to view.
 
-    - `clearly`: surfels whose change is above CHANGES, relative to their mean radiance. The mask grows to neighbours whose change is above
-      FAINT_CHANGES.
-    - `faintly`: surfels whose change is above FAINTEST_CHANGES.
-    - `tells`: surfels that can be judged, because they are coloured and enough photos see them.
+    - `clearly`: the radiance changes by more than CHANGES times its mean. Neighbours with more than FAINT_CHANGES are added.
+    - `faintly`: the radiance changes by more than FAINTEST_CHANGES times its mean.
+    - `tells`: the surfel can be judged, because it is coloured and enough photos show it.
 
     `clearly` and `faintly` mark only surfels whose radiance changes along their own colour.
     """
@@ -55,7 +54,7 @@ def change_seen(observations: Observations, wanted: Tensor) -> float:
     """Measure how much the surface changes with the viewing direction: a cubic mean over the surfels `wanted` (N,).
 
     A surfel's change is the standard deviation of its sRGB-encoded colour over the photos. Surfels are weighted by the pixels they cover. A
-    cubic mean lets a small part that changes much, such as a chrome handle, count more than a plain mean. Returns 0 if no surfel is usable.
+    cubic mean lets a small part that changes much, such as a chrome handle, count more. Returns 0 if no photo shows the surfels well.
     """
     usable = observations.usable
     count = usable.sum(dim=1).clamp_min(2)
@@ -74,7 +73,7 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Shining:
     A metal tints what it reflects: its radiance changes along its own colour. A dielectric's reflection has the light's colour, which is
     grey on average, whatever the dielectric's own colour is. The direction of change is the first principal axis of the linear radiance
     over the photos. Radiance is first averaged over neighbouring surfels. This cancels errors by slightly misaligned texture, but not
-    highlights. Surfels near grey tell nothing.
+    highlights. Surfels that are nearly grey are not judged.
     """
     near = neighbours(positions, NEIGHBOURS)
     mean, change, known = averaged(observations, near)

@@ -51,10 +51,10 @@ class Found(NamedTuple):
 
 
 def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
-    """Find surfels whose kind, metal or paint, is wrong, by what photos tell of them and their neighbours (see `material.mirrored`).
+    """Find surfels that the training has taken for the wrong kind, metal or paint. The evidence is from photos (see `material.mirrored`).
 
-    Evidence for either kind spreads over a surface. Where no evidence arrives, surfels keep the kind that training has found so far. That
-    kind never spreads to neighbours of the other kind.
+    Evidence for either kind spreads to neighbours over a surface. Where none arrives, surfels keep the kind that the training has found so
+    far. The kind found so far is no evidence, so it does not turn neighbours of the other kind.
     """
     graph, part, metal, paint = _evidence(surfels, seen, fit)
     was, none = (surfels.metallic > 0.5).numpy(), 1e-4
@@ -77,18 +77,21 @@ def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
 def doubt(surfels: Surfels, seen: Seen, fit: Fit) -> Tensor:
     """Measure how little photos tell metal from paint, for each surfel: (N,) in 0..1. What the training has decided has no influence.
 
-    Doubt is 0 where photos tell. It is 1 where hardly any pixel shows the surfel, or where photos tell nothing about its piece. Elsewhere
-    it rises with the distance from surfels of the same piece about which photos tell.
+    Doubt is 0 where photos show the kind clearly. It is 1 where hardly any pixel shows the surfel, or where photos show nothing about its
+    piece. Elsewhere it rises with the distance from surfels of the same piece whose kind photos show.
 
-    Let p be the probability of metal. Doubt is 1 − |2 p − 1|. The value 2 p − 1 solves the system of `decide`, with metals at 1 and paint
-    at −1. The weight OPEN draws all surfels to 0, whereas `decide` draws them to the kind that training has found so far.
+    Let p be the probability of metal. Doubt is 1 − |2 p − 1|. The value 2 p − 1 solves the linear system of `decide`, with metals at 1 and
+    paint at −1. The weight OPEN draws all surfels to 0. (In `decide`, surfels are drawn to the kind that the training has found so far.)
     """
     graph, _, metal, paint = _evidence(surfels, seen, fit)
     return 1 - torch.from_numpy(_solve(graph, metal + paint + OPEN, metal - paint)).float().abs().clamp_max(1)
 
 
 def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the graph's Laplacian (N, N), whether each surfel has enough pixels (N,), and the evidence for metal (N,) and paint (N,)."""
+    """Return four things: the Laplacian (N, N), which surfels take part (N,), and the evidence for metal (N,) and paint (N,).
+
+    A surfel takes part if photos show it in more than FRINGE pixels. Evidence lies between 0, for none, and SURE.
+    """
     graph, part = _laplacian(surfels.positions, seen), (seen.pixels > FRINGE).double().numpy()
     ratio = np.asarray((fit.ratio.clamp(1e-3, 1e3).log().double() * fit.seen).numpy())
     mirrors = (fit.slope > SLOPE) & (fit.reflectance.amax(dim=1) > REFLECTANCE)
@@ -110,7 +113,7 @@ def _solve(graph: sparse.csr_matrix, weight: np.ndarray, weighted: np.ndarray) -
 
 
 def _laplacian(positions: Tensor, seen: Seen) -> sparse.csr_matrix:
-    """Return the Laplacian (N, N) of the graph of neighbouring surfels."""
+    """Return the Laplacian (N, N) of the graph of neighbouring surfels. Edges within one piece have the largest weights, up to 1."""
     points, near = positions.double().numpy(), neighbours(positions, LINKED + 1)[:, 1:].numpy()
     count = len(points)
     one, other = np.repeat(np.arange(count), near.shape[1]), near.ravel()
