@@ -51,9 +51,12 @@ def read_exr_header(path: str | os.PathLike) -> tuple[int, int, bool]:
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
             headers = [part.header for part in file.parts]
+            _check_flat(path, headers)
             names = [{channel.name for channel in header["channels"]} for header in headers]
             part = next((i for i, found in enumerate(names) if set("RGB") <= found), 0)
             data, display = (np.array(headers[part][name]) for name in ("dataWindow", "displayWindow"))
+    except InputError:
+        raise
     except Exception:
         raise _broken(path) from None
     if not np.array_equal(data, display):
@@ -74,7 +77,9 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
         raise InputError(f"{path} is missing")
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
-            windows = [np.array(part.header["dataWindow"]) for part in file.parts]
+            headers = [part.header for part in file.parts]
+            _check_flat(path, headers)
+            windows = [np.array(header["dataWindow"]) for header in headers]
         for low, high in windows:  # every part is decoded
             width, height = (high - low + 1).tolist()
             check_pixels(path, width, height, *_FEWEST)
@@ -86,6 +91,8 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
         raise
     except Exception:  # the binding raises RuntimeError, ValueError or its own errors
         raise _broken(path) from None
+    if len({values.shape for values in channels.values()}) > 1:
+        raise InputError(f"{path} has channels of several sizes: save all at the full size")
     if {"R", "G", "B"} <= channels.keys():
         names = [name for name in "RGBA" if name in channels]
         # No second copy: a panorama of 8192×4096 takes 400 MB.
@@ -95,6 +102,12 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
     raise InputError(
         f"{path} has the channels {', '.join(sorted(channels))}: save it as plain RGB, RGBA or one channel"
     )
+
+
+def _check_flat(path: Path, headers: list[dict]) -> None:
+    """Raise InputError if a part of the file is deep: such a pixel has a list of samples."""
+    if any(header["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile) for header in headers):
+        raise InputError(f"{path} is a deep picture, with several samples a pixel: save it flattened")
 
 
 def _broken(path: Path) -> InputError:
