@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -28,6 +29,7 @@ DISK_ERRORS = tuple(
     )
     if hasattr(errno, name)
 )
+PAUSES = (0.05, 0.15, 0.3, 0.5)  # seconds between attempts to rename a file
 _TEMPORARY = re.compile(r"\.refgs-[0-9a-f]{16}\.tmp")
 
 
@@ -49,7 +51,7 @@ def whole(path: str | os.PathLike, durable: bool = True) -> Iterator[Path]:
         yield temporary
         if durable:
             _sync(temporary, os.O_RDWR)  # Windows refuses to sync what is open for reading
-        os.replace(temporary, path)
+        _replace(temporary, path)
         if durable and os.name == "posix":  # nowhere else can a folder be opened
             with suppress(OSError):  # some network file systems sync no folder
                 _sync(path.parent, os.O_RDONLY)
@@ -60,6 +62,16 @@ def whole(path: str | os.PathLike, durable: bool = True) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _replace(source: Path, target: Path) -> None:
+    """Rename a file, in place of another. Windows refuses while a program reads the other: try again for a second."""
+    for pause in PAUSES:
+        try:
+            return os.replace(source, target)
+        except PermissionError:
+            time.sleep(pause)
+    os.replace(source, target)
 
 
 def remove_leftovers(folder: Path) -> None:
