@@ -211,8 +211,9 @@ def _install(home: Path, uv: Path, trainer: Path) -> None:
     _start_trainer(python(home))
     (home / "origin").write_text(said, encoding="utf-8")
     _marker(home).write_text(trainer.name.split("-")[1], encoding="utf-8")
-    program.unlink()
-    _delete(home / "cache")
+    with contextlib.suppress(OSError):  # Windows removes no open file: the trainer is installed all the same
+        program.unlink()
+        _delete(home / "cache")
 
 
 def _choose_lock(program: Path, variables: dict[str, str], home: Path, locks: Path) -> Path:

@@ -19,7 +19,20 @@ from typing import NamedTuple
 
 # The trainer's floors, the lowest first. A module may import its own floor and those below. CONTRIBUTING.md describes each floor.
 FLOORS = (
-    ("", "asked", "camera", "clock", "color", "effective", "errors", "events", "memory", "paths", "settings"),
+    (
+        "",
+        "asked",
+        "camera",
+        "clock",
+        "color",
+        "effective",
+        "errors",
+        "events",
+        "memory",
+        "paths",
+        "process",
+        "settings",
+    ),
     ("formats",),
     ("kernels",),
     ("model",),

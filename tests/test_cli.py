@@ -1,11 +1,14 @@
-"""Test that help and errors in arguments are printed without importing torch, which takes seconds."""
+"""Test the command line's door: help and wrong arguments without importing torch, exit statuses whatever the system lacks."""
 
+import os
 import subprocess
 import sys
 
 import pytest
 import tomli_w
 
+from refgs import process
+from refgs.errors import TRY_AGAIN
 from refgs.settings import load_settings
 
 HELP, WRONG = 0, 2
@@ -73,3 +76,95 @@ def test_torch_is_not_imported(tmp_path, status, words, says):
     got, said, imported = refgs(tmp_path, *words.split())
     assert got == status and not imported, said
     assert " ".join(says.split()) in " ".join(said.replace("│", " ").split())
+
+
+def in_shell(tmp_path, line: str, **variables: str) -> tuple[int, str, str]:
+    """Run a line of bash in which `refgs` is the command. Return its exit status, its output and its errors."""
+    program = f'refgs() {{ "{sys.executable}" -m refgs.cli "$@"; }}; {line}'
+    done = subprocess.run(
+        ["bash", "-c", program], cwd=tmp_path, env=os.environ | variables, capture_output=True, timeout=300
+    )
+    return done.returncode, done.stdout.decode(), done.stderr.decode()
+
+
+POSIX = pytest.mark.skipif(os.name != "posix", reason="a POSIX shell closes the streams")
+MISSING = "refgs: photos: there is no such folder. Name the folder that holds the capture.\n"
+
+
+@POSIX
+@pytest.mark.parametrize(
+    ("line", "status", "errors"),
+    [
+        ("refgs --help >&-", 0, ""),
+        ("refgs --help >&- 2>&- <&-", 0, ""),
+        ("refgs check photos >&-", WRONG, MISSING),
+        ("refgs check photos 2>&-", WRONG, ""),
+        ("refgs check photos >&- 2>&- <&-", WRONG, ""),
+        ("refgs check photos 2>/dev/full", WRONG, ""),
+        ("refgs --help | true; exit ${PIPESTATUS[0]}", 0, ""),
+        ("refgs check photos 2>&1 | true; exit ${PIPESTATUS[0]}", WRONG, ""),
+        (
+            "refgs --help >/dev/full",
+            TRY_AGAIN,
+            "refgs: what was printed cannot be written (No space left on device): mend that, and run the command again\n",
+        ),
+    ],
+)
+def test_streams_that_are_closed_or_full(tmp_path, line, status, errors):
+    if "/dev/full" in line and not os.path.exists("/dev/full"):
+        pytest.skip("this system has no /dev/full")
+    got, _, said = in_shell(tmp_path, line)
+    assert (got, said) == (status, errors)
+
+
+@POSIX
+def test_a_capture_is_checked_for_a_reader_that_leaves(ball_capture, tmp_path):
+    line = f"refgs check {ball_capture} | head -n 1; exit ${{PIPESTATUS[0]}}"
+    assert in_shell(tmp_path, line, PYTHONUNBUFFERED="1") == (0, "Layout: NeRF-Blender\n", "")
+
+
+@POSIX
+def test_files_do_not_get_what_is_printed(tmp_path):
+    """Check that a file which is opened while the output is closed does not take its place."""
+    program = (
+        "import os, refgs.process; refgs.process.open_streams(); f = open('file', 'w'); print(1); os.write(1, b'2')"
+    )
+    subprocess.run(["bash", "-c", f'"{sys.executable}" -c "{program}" >&- 2>&- <&-'], cwd=tmp_path, check=True)
+    assert (tmp_path / "file").read_text() == ""
+
+
+@POSIX
+def test_a_folder_that_was_deleted(tmp_path):
+    status, _, said = in_shell(tmp_path, "mkdir gone; cd gone; rmdir ../gone; refgs check photos")
+    assert (
+        status == WRONG and said.startswith("refgs: the current folder is no longer there: ") and said.count("\n") == 1
+    )
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the system cannot limit a process's memory")
+@pytest.mark.parametrize("kilobytes", [300_000, 2_000_000, 3_600_000])
+def test_too_low_a_limit_of_memory(tmp_path, kilobytes):
+    """Check that a process that may reserve too little says so: torch's import would fail, crash or hang."""
+    status, _, said = in_shell(tmp_path, f"ulimit -v {kilobytes}; refgs check photos")
+    least = f"limited to {kilobytes * 1024 / 1e9:.1f} GB (ulimit -v): allow at least 4 GB"
+    assert status == TRY_AGAIN and least in said and said.count("\n") == 1
+
+
+@POSIX
+@pytest.mark.parametrize("variables", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0"}])
+def test_names_beyond_ascii(tmp_path, variables):
+    status, _, said = in_shell(tmp_path, "refgs check 'é–日'", LANG="C", **variables)
+    assert status == WRONG and "there is no such folder" in said and said.count("\n") == 1
+
+
+def test_a_process_terminates_itself_on_windows(monkeypatch):
+    """Check that the handler of SIGTERM is called, which writes a checkpoint: Windows' `os.kill` would call none."""
+    heard = []
+    before = process.signal.signal(process.signal.SIGTERM, lambda *_: heard.append(1))
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("ends the process at once"))
+    try:
+        process.terminate()
+    finally:
+        process.signal.signal(process.signal.SIGTERM, before)
+    assert heard == [1]

@@ -1,7 +1,9 @@
 """Test that files are written completely or not at all, whoever else writes in their folder."""
 
+import errno
 import os
 import secrets
+import time
 
 import pytest
 
@@ -50,6 +52,30 @@ def test_a_failed_write_leaves_the_file_before(tmp_path):
         temporary.write_text("half")
         raise KeyError
     assert (tmp_path / "a.json").read_text() == "before" and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("refusals", [2, 100])
+def test_a_file_that_windows_refuses_to_replace(tmp_path, monkeypatch, refusals):
+    """Check that a file which another program reads for a moment is replaced after it, and that the old one stays otherwise."""
+    file, replace, left = tmp_path / "a.json", os.replace, [refusals]
+    file.write_text("before")
+
+    def refuse(source, target):
+        left[0] -= 1
+        if left[0] >= 0:
+            raise PermissionError(errno.EACCES, "Access is denied", str(source))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", refuse)
+    monkeypatch.setattr(time, "sleep", lambda seconds: None)
+    if refusals == 2:
+        write_text(file, "after")
+        assert file.read_text() == "after"
+    else:
+        with pytest.raises(PermissionError, match=r"denied: '.*a\.json'"):
+            write_text(file, "after")
+        assert file.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_a_full_disk_is_said_of_the_file(small_disk):

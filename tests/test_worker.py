@@ -173,6 +173,21 @@ def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture
     assert (run / "checkpoints" / f"{ended['iteration']:08d}.toml").exists(), list((run / "checkpoints").iterdir())
 
 
+def test_a_preview_that_cannot_be_written_does_not_end_the_training(talk, ball_capture, run):
+    """Check that one line says so, once. On Windows, a preview that Blender reads cannot be replaced; here a folder is in its way."""
+    talk.until("progress")
+    (run / "preview" / "view.png").mkdir(parents=True)
+    for _ in range(2):
+        talk.tell("preview")
+    said = talk.until("warning")["what"]
+    assert said.startswith(f"{run / 'preview' / 'view.png'}: the preview cannot be written (") and "\n" not in said
+    talk.until("progress")
+    (run / "preview" / "view.png").rmdir()
+    talk.tell("preview")
+    assert talk.until("preview")["iteration"] > 0
+    assert [event["what"] for event in talk.heard if event["event"] == "warning"] == [said]
+
+
 def test_a_training_is_cancelled_while_it_makes_masks(talk, tmp_path):
     photograph(tmp_path / "photos")
     talk.tell("train", **train(tmp_path / "photos", tmp_path / "run"))

@@ -1,6 +1,5 @@
 """Parse the command line. Each command imports its own modules, so that help and wrong arguments are answered at once."""
 
-import io
 import os
 import signal
 import sys
@@ -16,12 +15,13 @@ import typer
 import refgs
 from refgs.asked import Asked
 from refgs.errors import TRY_AGAIN, InputError, InputWarning, TryAgain, one_line
-from refgs.memory import shortage_named
+from refgs.memory import check_limit, shortage_named
 from refgs.paths import disk_errors_named
+from refgs.process import check_current_folder, open_streams, terminate
 
 STATUSES = (
     "Exit status: 0 done; 1 a fault of the program; 2 the input is wrong, a retry is useless; "
-    "75 try again: full disk, card that fails, run in use, SIGTERM; 130 Ctrl-C."
+    "75 try again: full disk or memory, card that fails, run in use, SIGTERM; 130 Ctrl-C."
 )
 app = typer.Typer(
     help=refgs.__doc__,
@@ -254,7 +254,8 @@ def worker() -> None:
 
 def _terminate(*_) -> None:
     """Handle SIGTERM: end with the status TRY_AGAIN. `commands.train` has a handler of its own, which writes a checkpoint first."""
-    os.write(2, b"refgs: terminated: run the command again\n")  # print may be at work already
+    with suppress(OSError):
+        os.write(2, b"refgs: terminated: run the command again\n")  # print may be at work already
     sys.exit(TRY_AGAIN)
 
 
@@ -262,7 +263,7 @@ def _end_with_input() -> None:
     """End this process by SIGTERM when its standard input closes: the process that started it has died."""
     while os.read(0, 1024):
         pass
-    os.kill(os.getpid(), signal.SIGTERM)
+    terminate()
 
 
 def _one_line(show):
@@ -283,16 +284,22 @@ def main() -> None:
     If the environment has REFGS_END_WITH_INPUT, the command also ends when its standard input closes. `refgs batch` sets it for the
     commands that it starts.
     """
-    for stream in (sys.stdout, sys.stderr):  # a path may hold what the terminal's encoding lacks
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+    output = open_streams()
     warnings.showwarning = _one_line(warnings.showwarning)
     signal.signal(signal.SIGTERM, _terminate)
     if "REFGS_END_WITH_INPUT" in os.environ:
         threading.Thread(target=_end_with_input, daemon=True).start()
     try:
         with shortage_named(), disk_errors_named([], "run the command again"):
+            check_current_folder()
+            check_limit()
             app(standalone_mode=True)
+    except SystemExit as ended:
+        sys.stdout.flush()
+        if not ended.code and output.error:
+            why = f"what was printed cannot be written ({output.error.strerror})"
+            _end(TRY_AGAIN, f"refgs: {why}: mend that, and run the command again\n")
+        raise
     except InputError as error:
         _end(TRY_AGAIN if isinstance(error, TryAgain) else 2, f"refgs: {one_line(error)}\n")
     except KeyboardInterrupt:

@@ -18,6 +18,7 @@ from refgs.errors import TRY_AGAIN, InputError, one_line
 from refgs.export.export_job import export as export_run
 from refgs.lock import remove_stale_lock
 from refgs.paths import clone_root, command_line, disk_errors_named, make_folders
+from refgs.process import terminate
 from refgs.run_folder import check_finished, run_metrics, update_metrics
 
 console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)  # paths are printed as they are
@@ -175,7 +176,7 @@ def _signals_to_stop(repeat: float | None = CHECKPOINT_BY, end: float = END_BY) 
         stopped.append(number)  # the training ends after this iteration, with a checkpoint
         if number == signal.SIGTERM:
             if repeat is not None:
-                after(repeat, lambda: os.kill(os.getpid(), signal.SIGTERM))
+                after(repeat, terminate)
             after(end, lambda: os._exit(TRY_AGAIN))
 
     def after(seconds: float, what: Callable[[], None]) -> None:

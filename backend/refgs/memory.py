@@ -6,8 +6,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from refgs.errors import InputError
+from refgs.errors import TryAgain
 
+# Words of torch, OpenCV, C++, the loader of libraries, the system, Python's threads.
+_SHORTAGES = ("DefaultCPUAllocator", "Insufficient memory", "std::bad_alloc", "failed to map segment")
+_SHORTAGES += ("annot allocate memory", "can't start new thread")
+LEAST = 4e9  # bytes that a process must be able to reserve: torch's libraries for CUDA alone take 3.4e9
 LESS = "close other programs, or ask for less: smaller photos, fewer surfels, smaller textures"
 
 
@@ -23,17 +27,36 @@ def trim() -> None:
 
 
 def is_shortage(error: BaseException) -> bool:
-    """Return True if an error of Python, NumPy, torch or OpenCV says that the main memory is full."""
+    """Return True if an error of Python, a library or the system's loader says that the main memory is full."""
     said = isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
-    return said or any(words in str(error) for words in ("DefaultCPUAllocator", "Insufficient memory"))
+    return said or any(words in str(error) for words in _SHORTAGES)
 
 
 @contextmanager
 def shortage_named(lower: str = LESS) -> Iterator[None]:
-    """Raise InputError if a `with` block runs out of main memory. `lower` is the advice that ends the message."""
+    """Raise TryAgain if a `with` block runs out of main memory. `lower` is the advice that ends the message."""
     try:
         yield
     except Exception as error:
         if not is_shortage(error):
             raise
-        raise InputError(f"memory is full: {lower}") from error
+        limit = f", or raise the limit of {_limit() / 1e9:.1f} GB (ulimit -v)" if _limit() >= 0 else ""
+        raise TryAgain(f"memory is full: {lower}{limit}") from error
+
+
+def check_limit() -> None:
+    """Raise TryAgain if the system lets this process reserve less than LEAST: libraries crash then, or hang, without a word."""
+    if 0 <= (limit := _limit()) < LEAST:
+        least = f"{LEAST / 1e9:.0f} GB, most of it for libraries"
+        raise TryAgain(
+            f"the memory of this process is limited to {limit / 1e9:.1f} GB (ulimit -v): allow at least {least}"
+        )
+
+
+def _limit() -> int:
+    """Return the bytes that this process may reserve, -1 if there is no limit."""
+    try:
+        import resource
+    except ModuleNotFoundError:  # Windows
+        return -1
+    return resource.getrlimit(resource.RLIMIT_AS)[0]

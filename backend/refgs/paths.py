@@ -10,6 +10,7 @@ import stat
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -34,6 +35,7 @@ DISK_ERRORS = tuple(
 )
 # A file system has no locks. Any other error means that a lock may be held: by another user, say.
 NO_LOCKS = {getattr(errno, name, None) for name in ("ENOLCK", "ENOSYS", "ENOTSUP", "EOPNOTSUPP")}
+PAUSES = (0.05, 0.15, 0.3, 0.5)  # seconds between attempts to rename a file
 _TEMPORARY = re.compile(r"\.refgs-[0-9a-f]{16}\.tmp")
 
 
@@ -55,7 +57,7 @@ def whole(path: str | os.PathLike, durable: bool = True) -> Iterator[Path]:
         yield temporary
         if durable:
             _sync(temporary, os.O_RDWR)  # Windows refuses to sync what is open for reading
-        os.replace(temporary, path)
+        _replace(temporary, path)
         if durable and os.name == "posix":  # nowhere else can a folder be opened
             with suppress(OSError):  # some network file systems sync no folder
                 _sync(path.parent, os.O_RDONLY)
@@ -66,6 +68,16 @@ def whole(path: str | os.PathLike, durable: bool = True) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _replace(source: Path, target: Path) -> None:
+    """Rename a file, in place of another. Windows refuses while a program reads the other: try again for a second."""
+    for pause in PAUSES:
+        try:
+            return os.replace(source, target)
+        except PermissionError:
+            time.sleep(pause)
+    os.replace(source, target)
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -269,7 +269,8 @@ def _no_photos_left(out: Path) -> Iterator[None]:
     """
     try:
         yield
-    except BaseException:
+    except BaseException as error:
+        traceback.clear_frames(error.__traceback__)  # they refer to mapped photos
         _remove_photos(out)
         raise
 
@@ -337,7 +338,7 @@ def _finish(trainer: "Trainer") -> float | None:
 
 
 def _remove_photos(out: Path) -> None:
-    """Remove the reduced photos from a run folder."""
+    """Remove the reduced photos from a run folder. Nobody may refer to them: Windows removes no mapped file."""
     from refgs.capture import remove_cached
 
     remove_cached(out / PHOTOS)

@@ -170,6 +170,7 @@ class Worker:
         self._keep = False  # run jobs to their end after the input has closed
         self._attentive = True  # no job runs that cannot read commands
         self._open = True  # CLOSED has not been taken from the queue
+        self._blind = False  # a warning has said that no preview can be written
         self._closed = False  # the input has ended; commands may still be queued
 
     def listen(self, commands: IO[bytes]) -> None:
@@ -330,13 +331,22 @@ class Worker:
                     paused = command.command == "pause"
                     self.send("paused" if paused else "resumed", {"iteration": state.iteration})
                 case "preview":
-                    self.send("preview", write_preview(state))
+                    self._preview(state)
                 case "cancel":
                     return True
                 case "stop":
                     state.total = state.iteration
                     return True
         return False
+
+    def _preview(self, state: State) -> None:
+        """Write a preview. A preview that cannot be written, for Windows replaces no open file, does not end the training."""
+        try:
+            self.send("preview", write_preview(state))
+        except OSError as error:
+            if not self._blind:
+                self.send("warning", {"what": f"{error.filename}: the preview cannot be written ({error.strerror})"})
+            self._blind = True
 
     def _export(self, command: Export) -> tuple[str, dict]:
         display = None if command.display_splats is None else Path(command.display_splats)

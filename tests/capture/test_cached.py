@@ -60,6 +60,22 @@ def test_photos_of_another_size_or_changed_since_are_read_anew(views, tmp_path):
     assert len([*tmp_path.iterdir()]) == 2 * len(views)
 
 
+def test_a_file_that_is_mapped_still_stays_on_windows(views, tmp_path, monkeypatch):
+    load_views(views, SIDE, tmp_path)
+
+    def refuse(file, missing_ok=False):
+        raise PermissionError(13, "Access is denied", str(file))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(tmp_path), "unlink", refuse)
+        patched.setattr("refgs.paths.Path.unlink", refuse)
+        smaller = load_views(views, 32, tmp_path)
+    for view, loaded in zip(views, smaller, strict=True):
+        check_same(loaded, load_view(view, 32))
+    load_views(views, 32, tmp_path)
+    assert len([file for file in tmp_path.iterdir() if file.suffix == ".npy"]) == 2 * len(views)
+
+
 def test_half_a_file_does_not_count(views, tmp_path):
     load_views(views, SIDE, tmp_path)
     for file in tmp_path.glob("*.image.*"):

@@ -177,6 +177,8 @@ RAINBOW = cv2.applyColorMap(np.tile(np.arange(64, dtype=np.uint8) * 4, (48, 1)),
         ("depth/0001.png", RAINBOW, "false colours"),
         ("depth/0001.npy", np.ones((48, 64)), "no depth in it"),
         ("depth/0001.npy", 1 + slopes(32, 48)[..., 0], "32×48 pixels"),
+        ("normals/0001.npy", np.zeros((0, 0, 3)), "an array of 0×0×3 is no map of 3 numbers"),
+        ("depth/0001.npy", np.zeros((0, 4)), "an array of 0×4 is no map of 1 numbers"),
     ],
 )
 def test_files_that_do_not_fit_are_refused(tmp_path, name, values, says):

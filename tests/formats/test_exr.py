@@ -117,3 +117,15 @@ def test_a_file_of_a_kilobyte_takes_no_memory_for_the_pixels_that_it_declares(tm
         read_exr(file)
     with pytest.raises(InputError, match="do not fit"):
         read_exr_header(file)
+
+
+def test_deep_pictures_are_refused(tmp_path):
+    """Check that a picture with several samples a pixel, as compositing programs write, is told from a broken file."""
+    samples = np.empty((2, 3), object)
+    for pixel in np.ndindex(samples.shape):
+        samples[pixel] = np.ones(2, np.float32)
+    header = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
+    OpenEXR.File(header, dict.fromkeys("RGB", samples)).write(str(tmp_path / "deep.exr"))
+    for read in (read_exr, read_exr_header):
+        with pytest.raises(InputError, match=r"deep\.exr is a deep EXR: save it flattened"):
+            read(tmp_path / "deep.exr")

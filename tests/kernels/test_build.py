@@ -76,6 +76,27 @@ def test_cache_that_cannot_be_written(tmp_path):
         build(target("linux", "x86_64", "sse4"), tmp_path / "file" / "cache")
 
 
+@pytest.mark.parametrize(
+    ("system", "machine", "said"),
+    [
+        ("darwin", "x86_64", "darwin x86_64"),
+        ("win32", "ARM64", "win32 aarch64"),
+        ("linux", "riscv64", "linux riscv64"),
+        ("win32", "x86", "win32 x86"),
+        ("freebsd14", "amd64", "freebsd14 x86_64"),
+    ],
+)
+def test_platforms_without_kernels(monkeypatch, system, machine, said):
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(load.platform, "machine", lambda: machine)
+    load.supported.cache_clear()
+    try:
+        with pytest.raises(InputError, match=f"^there are no kernels for {said}: train on one of linux x86_64, "):
+            load._load.__wrapped__(load.supported()[0])
+    finally:
+        load.supported.cache_clear()
+
+
 def test_unknown_instruction_set(monkeypatch):
     monkeypatch.setenv("REFGS_ISA", "mmx")
     with pytest.raises(InputError, match="REFGS_ISA=mmx"):

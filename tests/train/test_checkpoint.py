@@ -1,4 +1,5 @@
 import os
+from pathlib import Path
 
 import pytest
 import tomli_w
@@ -23,6 +24,24 @@ def test_the_last_two_are_kept(tmp_path):
     tensors, facts = checkpoint.load(folder)
     assert tensors["x"].tolist() == [30, 30, 30]
     assert facts == {"iteration": 30, "seconds": 1.5}
+
+
+def test_one_that_is_open_is_removed_later(tmp_path, monkeypatch):
+    """Refuse to remove files, as Windows does while a program reads them."""
+
+    def refuse(file, missing_ok=False):
+        if file.suffix == ".safetensors":
+            raise PermissionError(13, "Access is denied", str(file))
+        unlink(file, missing_ok)
+
+    unlink, folder = Path.unlink, tmp_path / "checkpoints"
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "unlink", refuse)
+        for iteration in (10, 20, 30, 40):
+            checkpoint.save(folder, iteration, {"x": torch.full((3,), float(iteration))}, {})
+    assert checkpoint.complete(folder) == [30, 40]
+    checkpoint.save(folder, 50, {"x": torch.full((3,), 50.0)}, {})
+    assert sorted(file.stem for file in folder.iterdir()) == ["00000040"] * 2 + ["00000050"] * 2
 
 
 def test_half_a_checkpoint_does_not_count(tmp_path):

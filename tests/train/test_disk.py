@@ -1,12 +1,14 @@
 """Test disks that fill up or are removed during a training or an export."""
 
 import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
-from refgs import commands, train_job
+from refgs import capture, commands, train_job
 from refgs.asked import Asked
-from refgs.capture import read_capture
+from refgs.capture import cached, read_capture, remove_cached
 from refgs.errors import InputError
 from refgs.export.export_job import export
 from refgs.report.page import write_report
@@ -41,6 +43,28 @@ def test_a_disk_that_is_taken_out(ball_capture, tmp_path):
     assert trainer.iteration == 41
     trainer, _ = train(ball_capture, disk / "run", lambda trainer: False, resume=True)
     assert trainer.ended and (disk / "run" / "splats.ply").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize("end", ["done", "failed"])
+def test_no_photo_is_mapped_when_photos_are_removed(ball_capture, tmp_path, monkeypatch, end):
+    """Check that reduced photos are no longer in use when the training ends, or fails before it starts. Windows would keep them."""
+    photos, mapped = tmp_path / "run" / "photos", []
+
+    def remove(folder):
+        mapped.append([line for line in Path("/proc/self/maps").read_text().splitlines() if str(photos) in line])
+        remove_cached(folder)
+
+    monkeypatch.setattr(cached, "LARGE", 0)
+    monkeypatch.setattr(capture, "remove_cached", remove)
+    words = [*SMALL, "train.iterations=20"]
+    if end == "failed":
+        monkeypatch.setattr("refgs.train.trainer.Measures", lambda state: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            train(ball_capture, tmp_path / "run", lambda state: False, *words)
+    else:
+        train(ball_capture, tmp_path / "run", lambda state: not photos.is_dir(), *words)
+    assert mapped == [[]] and not photos.exists()
 
 
 def test_a_disk_that_is_full(ball_capture, small_disk):

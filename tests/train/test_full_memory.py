@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from refgs.errors import InputError
+from refgs.errors import TryAgain
 from refgs.memory import shortage_named
 
 TRAIN = """
@@ -38,11 +38,27 @@ def test_a_training_says_what_to_lower(ball_capture, tmp_path):
     said = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     assert said.startswith("memory is full: close other programs and resume") and said.count("\n") == 1
     assert "image.max_side, now 400" in said and "surfels.budget, now 500" in said
+    assert said.endswith("or raise the limit of 34.4 GB (ulimit -v)\n")
 
 
-@pytest.mark.parametrize("fill", [lambda: np.empty(1 << 60, np.uint8), lambda: [0] * (1 << 60), lambda: cv2_error()])
+def fail(error: Exception) -> None:
+    raise error
+
+
+@pytest.mark.parametrize(
+    "fill",
+    [
+        lambda: np.empty(1 << 60, np.uint8),
+        lambda: [0] * (1 << 60),
+        lambda: cv2_error(),
+        lambda: fail(ImportError("libtorch_cpu.so: failed to map segment from shared object")),
+        lambda: fail(OSError("libgomp.so: cannot allocate memory in static TLS block")),
+        lambda: fail(RuntimeError("can't start new thread")),
+        lambda: fail(RuntimeError("std::bad_alloc")),
+    ],
+)
 def test_shortages_are_known(fill):
-    with pytest.raises(InputError, match="memory is full: close"), shortage_named():
+    with pytest.raises(TryAgain, match="memory is full: close"), shortage_named():
         fill()
 
 

@@ -41,7 +41,8 @@ def load_views(views: list[View], max_side: int, folder: Path) -> list[LoadedVie
     ]
     for file in folder.glob("*"):
         if file.name.split(".")[0] not in names:
-            file.unlink(missing_ok=True)
+            with suppress(OSError):  # Windows removes no mapped file
+                file.unlink()
     return loaded
 
 

@@ -156,8 +156,8 @@ def _read_array(path: Path, channels: int) -> np.ndarray:
         values /= np.iinfo(loaded.dtype).max
     values = values.squeeze()
     if channels == 1 and values.ndim == 2:
-        return values[..., None]
-    if values.ndim != 3 or channels not in (values.shape[0], values.shape[2]):
+        values = values[..., None]
+    if values.size == 0 or values.ndim != 3 or channels not in (values.shape[0], values.shape[2]):
         shape = "×".join(map(str, loaded.shape))
         raise InputError(f"{path}: an array of {shape} is no map of {channels} numbers a pixel. Save one a file.")
     return values if values.shape[2] == channels else values.transpose(1, 2, 0)

@@ -49,10 +49,10 @@ def read_exr_header(path: str | os.PathLike) -> tuple[int, int, bool]:
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
             headers = [part.header for part in file.parts]
+            _check_flat(path, headers)
             names = [{channel.name for channel in header["channels"]} for header in headers]
             part = next((i for i, found in enumerate(names) if set("RGB") <= found), 0)
             data, display = (np.array(headers[part][name]) for name in ("dataWindow", "displayWindow"))
-            _check_flat(path, headers)
     except InputError:
         raise
     except Exception:
@@ -78,8 +78,8 @@ def read_exr(path: str | os.PathLike, is_data: bool = False) -> np.ndarray:
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
             headers = [dict(part.header) for part in file.parts]  # closing the file empties them
-            windows = [np.array(header["dataWindow"]) for header in headers]
             _check_flat(path, headers)
+            windows = [np.array(header["dataWindow"]) for header in headers]
         for low, high in windows:  # every part is decoded
             width, height = (high - low + 1).tolist()
             check_pixels(path, width, height, *_FEWEST)
@@ -92,6 +92,8 @@ def read_exr(path: str | os.PathLike, is_data: bool = False) -> np.ndarray:
         raise
     except Exception:  # the binding raises RuntimeError, ValueError or its own errors
         raise _broken(path) from None
+    if len({values.shape for values in channels.values()}) > 1:
+        raise InputError(f"{path} has channels of several sizes: save all at the full size")
     if {"R", "G", "B"} <= channels.keys():
         names = [name for name in "RGBA" if name in channels]
         # No second copy: a panorama of 8192×4096 takes 400 MB.

@@ -52,8 +52,12 @@ TARGETS = {
 def target(system: str, machine: str, isa: str) -> Target:
     """Return the compiler's target for a platform, a machine and an instruction set.
 
-    `system` is `sys.platform`, `machine` is "x86_64" or "aarch64", `isa` is "sse4", "avx2", "avx512" or "neon".
+    `system` is `sys.platform`, `machine` is "x86_64" or "aarch64", `isa` is "sse4", "avx2", "avx512" or "neon". Raises InputError for a
+    platform without kernels.
     """
+    if (system, machine) not in TARGETS:
+        known = ", ".join(" ".join(one) for one in TARGETS)
+        raise InputError(f"there are no kernels for {system} {machine}: train on one of {known}")
     platform, extension, processors = TARGETS[system, machine]
     return Target(platform, processors[isa], extension)
 

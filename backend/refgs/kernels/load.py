@@ -17,13 +17,19 @@ from refgs.errors import InputError
 from refgs.kernels import cuda
 from refgs.kernels.build import build, cache_folder, sizes, target
 
-MACHINES = {"AMD64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
+MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}  # other names of processors
+
+
+def _machine() -> str:
+    """Return the processor's name, such as "x86_64"."""
+    name = platform.machine().lower()
+    return MACHINES.get(name, name)
 
 
 @functools.cache
 def supported() -> list[str]:
     """List the instruction sets that the kernels can use on this processor, the best first."""
-    if MACHINES.get(platform.machine()) == "aarch64":
+    if _machine() == "aarch64":
         return ["neon"]
     sets = ["avx512", "avx2", "sse4"]
     return sets[{"AVX512": 0, "AVX2": 1}.get(torch.backends.cpu.get_cpu_capability(), 2) :]
@@ -44,7 +50,7 @@ def _keep_memory() -> None:
 @functools.cache
 def _load(isa: str) -> ctypes.CDLL:
     _keep_memory()
-    path = build(target(sys.platform, MACHINES[platform.machine()], isa), cache_folder())
+    path = build(target(sys.platform, _machine(), isa), cache_folder())
     library = ctypes.CDLL(str(path))
     for name, arguments in sizes().items():
         getattr(library, name).restype = ctypes.c_int64

@@ -55,11 +55,13 @@ def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[s
             raise TryAgain(f"{folder}: the disk is full; {kept}: free some space, then train with --resume") from None
         raise
     for old in complete(folder)[:-KEPT]:
-        for file in reversed(_files(folder, old)):
-            file.unlink()
+        with suppress(OSError):  # Windows removes no open file: the next save tries again
+            for file in reversed(_files(folder, old)):
+                file.unlink()
     for file in folder.glob("*.safetensors"):  # left by a process that was killed between writing the two files
         if not file.with_suffix(".toml").exists():
-            file.unlink()
+            with suppress(OSError):
+                file.unlink()
 
 
 def complete(folder: Path) -> list[int]:
