@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from refgs.errors import InputError
-from tests.makers.mutants import LINKS, mutant, put_link
+from tests.makers.mutants import LINKS, damage_folder, mutant, put_link
 from tests.makers.readers import READERS, Reader
 
 MOST = 1 << 30  # bytes of memory for an input
@@ -46,9 +46,16 @@ def describe(count: int, seed: str, number: int) -> dict[str, str]:
 
 
 def damage(file: Path, sample: bytes, kind: str, seed: str) -> None:
-    """Put a damaged sample, or a folder or link, in the place of a file. The same seed gives the same damage."""
+    """Put a damaged sample, or a folder or link, in the place of a file. The same seed gives the same damage.
+
+    If `kind` is "folder", damage the folder `file` instead, which is first copied anew from `file` with the suffix ".whole".
+    """
     dice = random.Random(seed)
     remove(file)
+    if kind == "folder":
+        shutil.copytree(file.with_suffix(".whole"), file)
+        damage_folder(file, dice)
+        return
     if dice.random() < 0.01:
         put_link(file, dice.choice(LINKS))
     else:
@@ -117,7 +124,9 @@ def main(folder: Path, count: int, seed: str, start: int) -> None:
             place.mkdir()
             reader.make(place)
             file = place / reader.file
-            sample = file.read_bytes()
+            if reader.kind == "folder":
+                shutil.copytree(file, file.with_suffix(".whole"))
+            sample = b"" if reader.kind == "folder" else file.read_bytes()
             reader.read(place)  # valid; and loads what is loaded late
             limit_memory()
             begun, slowest = time.process_time(), 0.0

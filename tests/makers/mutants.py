@@ -1,14 +1,20 @@
-"""Damage files as accidents and attackers do: bytes, values of JSON and TOML, words of text, and links in a file's place."""
+"""Damage files as accidents and attackers do: bytes, values of JSON and TOML, words of text, what a capture's files are and say."""
 
 import copy
 import json
+import math
+import os
 import random
+import stat
 import struct
 import tomllib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomli_w
+from PIL import Image
 
 _DEEP, _LONG = "@deep@", "@digits@"  # replaced in the text by what no writer of JSON or TOML writes
 HOSTILE = [
@@ -140,12 +146,98 @@ def _text(data: bytes, dice: random.Random) -> bytes:
 
 
 _BY_VALUE = {"json": _json, "toml": _toml, "lines": _lines, "text": _text}
-LINKS = ("", ".", "nowhere", "/dev/zero", "/dev/null", "/proc/self/mem", "itself")
+LINKS = ("", ".", "nowhere", "/dev/zero", "/dev/null", "/proc/self/mem", "itself", "fifo", "socket")
 
 
 def put_link(file: Path, to: str) -> None:
-    """Put something else in the place of a file: a folder (""), or a link: to its folder, to itself, to nothing or to a device."""
-    if to:
+    """Put something else in the place of a file: a folder (""), a pipe, a socket, or a link to its folder, itself, nothing or a device."""
+    if to == "fifo":
+        os.mkfifo(file)
+    elif to == "socket":
+        os.mknod(file, 0o600 | stat.S_IFSOCK)
+    elif to:
         file.symlink_to(file if to == "itself" else to)
     else:
         file.mkdir()
+
+
+def damage_folder(folder: Path, dice: random.Random) -> None:
+    """Damage a capture as people and programs do: in what its files are and say, not in their bytes."""
+    for _ in range(dice.choice((1, 1, 1, 2, 3))):
+        files = sorted(file for file in folder.rglob("*") if file.is_file() and not file.is_symlink())
+        if not files:
+            return
+        file, other = dice.choice(files), dice.choice(files)
+        match dice.randrange(10):
+            case 0:
+                file.unlink()
+            case 1:
+                file.unlink()
+                put_link(file, dice.choice(LINKS))
+            case 2:
+                file.write_bytes(other.read_bytes())
+            case 3:
+                name = dice.choice(
+                    (file.name.upper(), f"._{file.name}", f"{file.stem}.jpeg", f"{file.name}.png", "Thumbs.db", "é.png")
+                )
+                file.rename(file.with_name(name))
+            case 4:
+                file.with_name(
+                    dice.choice((f"._{file.name}", ".hidden", "Thumbs.db", f"{file.stem}_mask.png"))
+                ).write_bytes(b"\0" * 99)
+            case 5:
+                with open(file, "r+b") as opened:
+                    opened.truncate(dice.choice((0, 1, 20 << 30)))  # without taking room on the disk
+            case _ if file.suffix in (".png", ".jpg", ".exr"):
+                _other_picture(dice).save(file.with_suffix(".png"))
+            case _ if file.suffix == ".npy":
+                np.save(file, np.full(dice.choice(_SHAPES), dice.choice((0.0, 1.0, math.nan, 1e308))))
+            case _ if file.suffix == ".json":
+                with suppress(ValueError):  # another file's content is in it
+                    file.write_text(json.dumps(_other_poses(json.loads(file.read_text()), dice)))
+
+
+_SHAPES = [(), (0,), (0, 0, 3), (3,), (4, 4), (5, 7, 3), (5, 7, 4), (2, 5, 7, 3), (1, 1), (100_000, 1, 3)]
+
+
+def _other_picture(dice: random.Random) -> Image.Image:
+    """Make a picture of another kind or size than the one that is expected."""
+    size = dice.choice(((1, 1), (48, 64), (64, 48), (65_535, 1), (7, 5), (640, 480)))
+    return Image.new(dice.choice(("1", "L", "LA", "P", "RGB", "RGBA", "I;16")), size, dice.choice((0, 1)))
+
+
+def _other_poses(value: Any, dice: random.Random) -> Any:
+    """Change all numbers, or all poses, in what `json.loads` returns in one way."""
+    factor, axes = dice.choice((0, -1, 1e-320, 1e-30, 1e30, 1e308, math.nan, math.inf)), dice.sample(range(4), 4)
+    way = dice.randrange(5)
+
+    def changed(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: changed(inner) for key, inner in value.items()}
+        if (
+            isinstance(value, list)
+            and len(value) == 4
+            and all(isinstance(row, list) and len(row) == 4 for row in value)
+        ):
+            return _other_pose(np.array(value, float), way, factor, axes).tolist()
+        if isinstance(value, list):
+            return [changed(inner) for inner in value]
+        return value * factor if way == 0 and isinstance(value, float) else value
+
+    return changed(value)
+
+
+def _other_pose(pose: np.ndarray, way: int, factor: float, axes: list[int]) -> np.ndarray:
+    """Change a matrix (4, 4): 1 scales the position, 2 swaps its axes, 3 transposes it, 4 moves it far away, 0 scales all of it."""
+    match way:
+        case 1:
+            pose[:3, 3] *= factor
+        case 2:
+            pose = pose[:, axes]
+        case 3:
+            pose = pose.T
+        case 4:
+            pose[:3, 3] += 5.4e6
+        case 0:
+            pose = pose * factor
+    return pose

@@ -21,6 +21,7 @@ from refgs.batch.listing import Ask, read_jobs
 from refgs.batch.steps import Step, recorded
 from refgs.camera import Camera
 from refgs.capture import cached, load_depth, load_normals, masks, read_cameras, read_capture, read_run_cameras
+from refgs.capture.check import describe
 from refgs.capture.files import photo_view
 from refgs.capture.images import load_view, read_codes, read_focal_length, read_header, read_mask
 from refgs.capture.nerf_blender import read_nerf_blender
@@ -73,7 +74,7 @@ class Reader(NamedTuple):
     """Read one kind of file.
 
     - `make` writes a valid sample into an empty folder.
-    - `file` is the damaged one of its files, of the `kind` that `tests.makers.mutants` names.
+    - `file` is the damaged one of its files, of the `kind` that `tests.makers.mutants` names; or a folder, whose kind is "folder".
     - `read` reads it from the folder. It may raise InputError.
     - `share` is how often it is tried, beside others: fast readers more often.
     """
@@ -307,7 +308,34 @@ def _pair(folder: Path) -> None:
     captures.nero(folder / "capture", 4, (["0"], ["1", "2", "3"]))
 
 
+def _read_capture(folder: Path) -> None:
+    """Read a capture as `refgs check` does, which loads all photos."""
+    describe(read_capture(folder / "capture"))
+
+
+def _folder(make: Callable[..., Path], *options, **more) -> Reader:
+    return Reader(_small(make, *options, **more), "capture", "folder", _read_capture, 0.3)
+
+
+def _with_masks_and_normals(folder: Path) -> Path:
+    captures.nerfstudio(folder, 6)
+    for photo in sorted((folder / "images").iterdir()):
+        mask = np.zeros((48, 64), np.uint8)
+        mask[12:36, 16:48] = 255
+        captures.write(folder / "masks" / photo.name, mask)
+        (folder / "normals").mkdir(exist_ok=True)
+        normals = np.random.default_rng(0).normal(size=(48, 64, 3))
+        np.save(folder / "normals" / f"{photo.stem}.npy", normals / np.linalg.norm(normals, axis=2, keepdims=True))
+    return folder
+
+
 READERS: dict[str, Reader] = {
+    "a capture by nerfstudio": _folder(captures.nerfstudio, 6),
+    "a capture with masks and normals": _folder(_with_masks_and_normals),
+    "a capture by NeRF-Blender": _folder(captures.nerf_blender, {"train": 5, "test": 2}),
+    "a capture by COLMAP, all files": _folder(captures.colmap, count=6),
+    "a capture of NeRO": _folder(captures.nero, 6),
+    "a capture of TensoIR": _folder(captures.tensoir, {"train": 5, "test": 1}, 16),
     "nerfstudio's transforms.json": Reader(
         _small(captures.nerfstudio, 4), "capture/transforms.json", "json", lambda f: read_capture(f / "capture"), 0.5
     ),
