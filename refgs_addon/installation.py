@@ -77,8 +77,8 @@ def python(home: Path) -> Path:
 def needed_bytes() -> float:
     """Estimate the disk space in bytes for the trainer.
 
-    A machine with nvidia-smi needs more, because it may get torch's CUDA build. Linux also needs more if only the CUDA build was locked at
-    release, because the package index has no other.
+    A machine with nvidia-smi needs more, because it may get torch's CUDA build. Linux also needs more if the add-on has locks, but
+    none for the CPU build: torch then comes from the package index, which has only the CUDA build for Linux.
     """
     locked = sys.platform == "linux" and (WHEELS / "lock.txt").is_file() and not (WHEELS / "lock-cpu.txt").is_file()
     return NEEDED_WITH_CARD if locked or shutil.which("nvidia-smi") else NEEDED
@@ -219,8 +219,8 @@ def _install(home: Path, uv: Path, trainer: Path) -> None:
 def _choose_lock(program: Path, variables: dict[str, str], home: Path, locks: Path) -> Path:
     """Return the lock for the build of torch that uv chooses for this machine.
 
-    If there is no such lock, change `variables` so that uv takes the package index's build. The name of a build is in torch's version, such
-    as 2.14.0+cpu. Versions in the package index have no such name.
+    A build is named at the end of torch's version, such as 2.14.0+cpu. The package index's build has no name, and its lock is lock.txt.
+    UV_TORCH_BACKEND in `variables` is set to the build. It is removed if the build has no lock of its own; then lock.txt is returned.
     """
     lock, wanted = locks / "lock.txt", home / "torch.txt"
     if "UV_TORCH_BACKEND" not in variables or not (pinned := re.search(r"^torch==\S+", lock.read_text(), re.M)):

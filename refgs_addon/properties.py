@@ -178,5 +178,5 @@ def _longest_side(item: bpy.types.Object) -> float:
 
 
 def _scale_to(item: bpy.types.Object, metres: float) -> None:
-    """Scale the Empty of an imported run by one factor until its longest side is as long as given."""
+    """Scale the Empty of an imported run by one factor until its longest side has this length in metres."""
     item.scale *= metres / max(_longest_side(item), 1e-12)

@@ -33,7 +33,7 @@ class Clock:
         self._events: list[tuple[str, torch.cuda.Event, torch.cuda.Event]] = []
 
     def resume(self, seconds: dict[str, float], processor: float) -> None:
-        """Add the seconds of each part from a checkpoint, when an interrupted training is resumed."""
+        """Take over times from the checkpoint of an interrupted training: `seconds` are added by part, and `processor` is replaced."""
         self.processor = processor
         for name, value in seconds.items():
             self._add(name, value)
@@ -91,7 +91,7 @@ class Clock:
 
 
 def _event() -> torch.cuda.Event:
-    """Record an event in a card's queue. Its time is that at which the card reaches the event."""
+    """Put an event into the GPU's queue, and return it. The event takes the time when the GPU reaches it."""
     event = torch.cuda.Event(enable_timing=True)
     event.record()
     return event

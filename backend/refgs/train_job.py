@@ -124,14 +124,14 @@ def choose_device(device: str, report: Report) -> str:
 
 
 def _less(settings: Settings) -> str:
-    """Say what to lower if main memory is full."""
+    """Return the advice for a full main memory: a text that names the settings to lower, with their present values."""
     side, budget = settings.image.max_side, settings.surfels.budget
     parts = f"smaller photos (image.max_side, now {side}) or fewer surfels (surfels.budget, now {budget})"
     return f"close other programs and resume, or train into a new folder with {parts}"
 
 
 def _known(asked: Asked) -> _Known:
-    """Read the settings, and check what can be checked before torch is imported."""
+    """Read the settings, and check the run folders: all that can be checked before torch is imported. Raises InputError."""
     if asked.resume:
         facts, settings = read_run_facts(asked.out)
         return _Known(settings, facts.preset, asked.out, facts)
@@ -365,7 +365,7 @@ def _most_memory() -> dict[str, int]:
 def _card_memory(what: str | None = None) -> Iterator[None]:
     """Raise TryAgain if a `with` block runs out of GPU memory, or if the card fails.
 
-    `what` is the message about the memory; None is the usual message.
+    `what` is the error message if memory runs out. If it is None, the message is that of `full_card`.
     """
     import torch
 

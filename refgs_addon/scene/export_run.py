@@ -137,7 +137,7 @@ def export_light(collection: bpy.types.Collection, path: Path) -> None:
 def export_mesh(collection: bpy.types.Collection, path: Path, engine: str = "Any Program") -> None:
     """Write a run's mesh with its textures. A .glb is a copy of the run's file; `mesh_exchange` writes .usdc and .fbx for `engine`.
 
-    Raises InputError if the run has no mesh, or if it was edited, because the mesh does not contain the edits.
+    Raises InputError if the run has no mesh, or if the run was edited: the mesh does not contain the edits.
     """
     mesh = run_folder(collection) / "mesh.glb"
     if is_edited(splats_of(collection)):

@@ -182,10 +182,10 @@ def _flatten_gaussians(rotation: np.ndarray, scale: np.ndarray) -> tuple[np.ndar
 
 
 def finite_rows(rows: np.ndarray) -> np.ndarray:
-    """Select the rows of a PLY whose splats are all finite. The trainer selects the same rows.
+    """Return the rows of a PLY in which all values of the splat are finite. The trainer selects the same rows.
 
-    Logits may be infinite: an opacity, which is 0 or 1 then, and the materials of Ref-Gaussian. Properties that are not a splat's do not
-    count.
+    Logits may be infinite. Opacity is a logit, and so are Ref-Gaussian's materials: infinity stands for exactly 0 or 1. Columns that no
+    splat needs are not checked.
     """
     names = [name for name in rows.dtype.names if _SPLATS.fullmatch(name)]
     logits = {"opacity"} if {*REF_GAUSSIAN} - {*names} else {"opacity", *REF_GAUSSIAN}

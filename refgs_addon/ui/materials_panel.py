@@ -65,7 +65,7 @@ class AddEdit(OnRun, bpy.types.Operator):
 
 
 class _OfEdit(ReportsErrors):
-    """Store which edit an operator works on. Base class. An edit is a modifier of the splats that changes their materials."""
+    """Base class of operators that work on an edit: a modifier of the splats that changes their materials. It stores which one."""
 
     splats: StringProperty(name="Splats", options={"HIDDEN"})
     edit: StringProperty(name="Edit", options={"HIDDEN"})
@@ -100,7 +100,7 @@ class SetMaterial(_OfEdit, bpy.types.Operator):
 
 
 class KeepMaterial(_OfEdit, bpy.types.Operator):
-    """Save the values of an edit as a material preset, or remove a preset. The list of presets shows this as buttons + and −.
+    """Save the values of an edit as a material preset, or remove a preset. Its buttons are + and − beside the list of presets.
 
     Blender's own operator cannot do this, because it does not read the inputs of a modifier. In Blender 4.3 it also overwrites a preset of
     the same name.

@@ -60,9 +60,9 @@ class Depot:
         self._mark, self._tickets = mark, Counter()
 
     def begin(self, roots: tuple[Path, ...]) -> tuple[Path, dict[Path, int]]:
-        """Register a step that writes to `roots`. Return the file `mark` of `__init__`, and a ticket for each of `roots`.
+        """Register a step that writes to `roots`. Return the file `mark` (see `__init__`), and a ticket for each of `roots`.
 
-        A step needs the ticket to write there. An earlier ticket is no longer valid: Ray has given up the step that has it.
+        To write there, a step needs the ticket. Earlier tickets are no longer valid: Ray has given up the steps that have them.
         """
         self._tickets.update(roots)
         return self._mark, {root: self._tickets[root] for root in roots}
@@ -84,7 +84,7 @@ class Depot:
         _write(root / name, map(_get, parts), time)
 
     def remove(self, root: Path, ticket: int, names: list[str]) -> None:
-        """Remove files that the step has removed."""
+        """Remove the originals of files that a step has removed. `names` are their paths in `root`; `ticket` is from `begin`."""
         self._check(root, ticket)
         for name in names:
             (root / name).unlink(missing_ok=True)
@@ -184,7 +184,7 @@ def _write(file: Path, parts: Iterator[bytes], time: int) -> None:
 
 
 class _Back:
-    """Copy back what changes in folders, in a thread, until `end` is called.
+    """Copy changed files in folders of this machine back to their originals, in a thread, until `end` is called.
 
     Ray stops a step by interrupting the main thread. The copying thread goes on, so the last changes are copied, too.
     """

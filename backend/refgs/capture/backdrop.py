@@ -84,7 +84,7 @@ def find_plane(
 
 
 class Backdrop:
-    """Hold the colours of a plane, and how much each differs between photos, on a square grid of SIDE² texels around the object.
+    """Hold the colours of a plane on a square grid of SIDE² texels around the object, and how much each colour differs between photos.
 
     Colours are logarithms of 8-bit values, times STEPS. So a photo's exposure and white balance add one offset to each channel.
     """
@@ -100,11 +100,11 @@ class Backdrop:
         self.to_world[3, 2] = 1
 
     def before(self, points: np.ndarray) -> np.ndarray:
-        """Mark the points (N, 3) that lie in front of the plane. Points nearer than ABOVE radii count as part of the plane."""
+        """Tell which points (N, 3) lie in front of the plane, as bool (N,). Up to ABOVE · `radius` above it, points count as the plane."""
         return self.plane.height(points) > ABOVE * self.radius
 
     def learn(self, images: list[np.ndarray], cameras: list[Camera], hidden: list[np.ndarray]) -> None:
-        """Learn from photos (H, W, 3) uint8 RGB. Pixels (H, W) that are `hidden` may show the object."""
+        """Learn the plane's colours from photos (H, W, 3) uint8 RGB. `hidden` (H, W) is true for pixels that may show the object."""
         stack = np.full((SIDE * SIDE, 3, len(images)), 255, np.uint8)
         bare = np.zeros((SIDE * SIDE, len(images)), bool)  # photos in which nothing may hide a texel
         for index, (image, camera, hide) in enumerate(zip(images, cameras, hidden, strict=True)):
@@ -134,13 +134,13 @@ class Backdrop:
     def likelihood(self, image: np.ndarray, camera: Camera, hidden: np.ndarray) -> np.ndarray:
         """Return how well each pixel's colour fits the bare plane, as float32 (H, W).
 
-        - Where the plane's colour is known: the probability that the plane's colour lies in a box of the size BIN around the pixel's
-          colour, in Lab.
-        - Where the photos show the plane, but its colour is not known, as below the object: a negative number, −(odds of object to plane).
-        - Elsewhere: NaN. All pixels are NaN if fewer than 200 show the plane in a known colour.
+        - Where the plane's colour is known: the probability, 0..1, that the plane's colour here lies in a box in Lab. The box is around the
+          pixel's colour, and BIN is its size.
+        - Where the plane's colour is not known, as below the object: −p, if the object is p times as likely there as the bare plane.
+        - Elsewhere, and where p is not known: NaN.
 
-        The photo's exposure and noise are measured on the pixels that are not `hidden`. If too few of them show the plane, all values are
-        NaN.
+        `hidden` (H, W) is true for pixels that may show the object. The others give the photo's exposure and noise. If fewer than 200 of
+        them show the plane in a known colour, the result is NaN for all pixels.
         """
         texel, meets = self._pixels_on(camera)
         known = meets & (remap(self.known.astype(np.uint8), texel, cv2.INTER_NEAREST) > 0)
@@ -195,10 +195,11 @@ class Backdrop:
 def _median(
     stack: np.ndarray, used: np.ndarray, offset: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the median (N, 3) and the spread (N, 3) of texels over photos, and the photos' exposures (3, photos), one for each channel.
+    """Return each texel's median (N, 3) and spread (N, 3) over the photos, and each photo's exposure by channel (3, photos).
 
     `stack` (N, 3, photos) holds the logarithms of the texels' values, and `used` (N, photos) is true where a photo's value counts.
-    Exposures are offsets of the logarithms. They are fitted unless `offset` gives them.
+    The results are on the same scale. Spread is a standard deviation, estimated from the quartiles. Exposures are offsets, and are fitted
+    unless `offset` gives them.
     """
     count = used.sum(axis=1)
     values = np.where(used[:, None], stack, np.float32(np.nan))

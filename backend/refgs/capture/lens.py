@@ -31,9 +31,9 @@ BEHIND = 1e3  # image position, at depth 1, of what a pinhole camera cannot see.
 class Lens:
     """Hold the lens of a photo: its intrinsics, the name of its model, and the model's coefficients.
 
-    Focal lengths and principal point are in pixels; pixel centres are at half-integers. The model is BROWN, with k1, k2, k3, k4, p1, p2, or
-    one of COLMAP's, with what follows the principal point in COLMAP's list of its parameters. `turns` are the clockwise quarter turns that
-    the photo was given since.
+    Focal lengths and principal point are in pixels; pixel centres are at half-integers. BROWN has the coefficients k1, k2, k3, k4, p1, p2.
+    Any other model is COLMAP's. Its coefficients are those that COLMAP lists after the principal point. `turns` counts the clockwise
+    quarter turns by which the photo differs from the one that the coefficients describe.
     """
 
     fx: float
@@ -52,7 +52,7 @@ class Lens:
     def distort(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the distorted image position (x', y') of an undistorted one (x, y). Both are on the image plane at depth 1.
 
-        It is NaN where the model has none.
+        The result is NaN where the model does not define a distorted position.
         """
         x, y = np.broadcast_arrays(x, y)
         for _ in range(self.turns):
@@ -68,9 +68,9 @@ class Lens:
         return u.reshape(x.shape), v.reshape(x.shape)
 
     def undistort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the undistorted image position of a distorted one (x', y'): the inverse of `distort`.
+        """Return the undistorted image position of a distorted one: the inverse of `distort`. Both are on the image plane at depth 1.
 
-        What a pinhole camera cannot see, at 90° from the axis or more, is put far away in the same direction.
+        A pinhole camera cannot see points at 90° from its axis or more. Their result is far from the image's centre, in the same direction.
         """
         x_seen, y_seen = np.broadcast_arrays(x, y)
         if self.model == BROWN:
@@ -139,8 +139,8 @@ def check_intrinsics(
 ) -> None:
     """Check the size, focal lengths and principal point of a photo, in pixels: pairs of horizontal and vertical.
 
-    Raises InputError if a value is not finite, or none that a lens has. The message begins with `where`, a name for the camera, and ends
-    with `advice`.
+    Raises InputError if a value is not finite, or if no real lens has such a value. The message begins with `where`, a name for the
+    camera, and ends with `advice`.
     """
     if not np.isfinite([*size, *focal, *centre]).all() or min(focal) <= 0 or round(min(size)) < 1:
         raise InputError(f"{where}: focal length or size is zero, negative or NaN. {advice}")

@@ -13,7 +13,10 @@ _LIKE_MASKS = re.compile(r"mask|matte|alpha|silhouette|segment", re.IGNORECASE)
 
 
 def not_used(capture: Capture) -> list[str]:
-    """Say in a line each, with a count and an example, which photos have no camera, and which masks are of no photo or are not read."""
+    """List the photos without a camera, the masks that belong to no photo, and the masks in folders that are not read.
+
+    Returns a line of text for each kind, with the number of files and an example. Returns [] if there are no such files.
+    """
     files = Files(capture_root(capture.folder, capture.layout))
     lines = []
     if capture.layout != "tensoir" and (photos := _without_camera(capture, files)):

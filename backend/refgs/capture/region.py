@@ -78,7 +78,7 @@ def is_near(region: Region) -> bool:
 def region_in(box: Box, views: list[View], silhouettes: list[tuple[View, np.ndarray]]) -> Region:
     """Find the region of interest inside a box: a ball around the part of the masked object that is in the box.
 
-    If there are no masks, or nothing in the box fits them, return the ball around the box. `silhouettes` are the pairs that
+    If there are no masks, or no point of the box is inside them, return the ball around the box. `silhouettes` are the pairs that
     `sample_silhouettes` returns. Raises InputError if no photo shows the box.
     """
     # About the box's centre, because `project` has 32 bits.
@@ -113,7 +113,8 @@ def look_at_centre(views: list[View]) -> tuple[np.ndarray, np.ndarray, float]:
 def warn_of_axes(layout: str, views: list[View]) -> list[str]:
     """Return a warning if a JSON file's axes look like OpenCV's: the cameras look away from the place where their optical axes meet.
 
-    Cameras that look out of a room hardly do: their axes miss each other. A rig may, so the file is read as its format says all the same.
+    The axes of cameras that look out of a room hardly meet, so these cameras cause no warning. Cameras on a rig may look outwards and have
+    axes that meet. So this is only a warning: the file is still read with the axes of its format.
     """
     _, depth, miss = look_at_centre(views)
     if layout not in ("nerfstudio", "nerf-blender") or (depth < 0).mean() < 0.75 or miss > 0.25:

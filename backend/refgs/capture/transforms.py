@@ -68,7 +68,8 @@ _UNDISTORT = "Undistort the photos to pinholes, and export their cameras again."
 def _lens_model(frame: Frame, where: str) -> tuple[str, tuple[float, ...]]:
     """Return the name and the coefficients of a frame's lens model (see `Lens`).
 
-    Raises InputError for a model that is not known, and for a coefficient or another statement about the lens that the model has not.
+    Raises InputError if the model is not known, if the frame has a lens key that does not belong to the model, or if a coefficient is
+    missing or invalid.
     """
     word = (frame.camera_model or ("OPENCV_FISHEYE" if frame.is_fisheye else "OPENCV")).upper()
     if word not in _MODELS:
@@ -143,7 +144,10 @@ _CONVENTIONS = {"opengl": OPENGL_TO_OPENCV, "blender": OPENGL_TO_OPENCV, "opencv
 
 
 def _camera_to_world(frame: Frame, where: str) -> np.ndarray | None:
-    """Return a frame's camera-to-world matrix with OpenCV's axes. It has OpenGL's unless the key `camera_convention` tells others."""
+    """Return a frame's camera-to-world matrix, converted to OpenCV's axes. Return None if its rows are not of equal length, or not of four.
+
+    In the file, the axes are those that the key `camera_convention` names, or else OpenGL's. Raises InputError for an unknown name.
+    """
     convention = frame.camera_convention or "opengl"
     if convention.lower() not in _CONVENTIONS:
         known = ", ".join(_CONVENTIONS)

@@ -109,7 +109,7 @@ class Capture:
 
     @cached_property
     def hashes(self) -> dict[str, str]:
-        """Hash the contents of the files that a training reads: photos, masks, and what other programs guessed. Keys are their paths."""
+        """Hash the files that a training reads: photos, masks, normals and depths guessed by other programs. Keys are relative paths."""
         files = [(v.image_path, v.mask_path, v.prior_normals, v.prior_depth) for v in self.views]
         return hash_files(self.folder, [path for paths in files for path in paths if path is not None])
 
@@ -121,10 +121,10 @@ class Capture:
         return hashlib.sha256(json.dumps([self.digest, self.hashes], sort_keys=True).encode()).hexdigest()
 
     def check_unchanged(self, run: Path, known: str) -> None:
-        """Raise InputError if this is not the capture that `run` was trained on, or if it has changed since. Name a file that has changed.
+        """Raise InputError if this is not the capture that `run` was trained on, or if it has changed since. The error names a file.
 
-        `known` is the fingerprint in run.toml. Earlier releases wrote `digest` instead. It does not depend on the contents of files, only
-        on their sizes.
+        `known` is the hash in run.toml: a fingerprint, or in runs of earlier releases a `digest`. The digest depends on the sizes of files,
+        not on their contents.
         """
         if known in (self.digest, self.fingerprint()):
             return

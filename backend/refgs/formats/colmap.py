@@ -189,7 +189,7 @@ def _points(numbers: array) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _entries(file: Path, first: Callable[[str], bool] = lambda line: True) -> list[str]:
-    """Return the lines of a COLMAP text file that `first` says begin an entry, without comments and empty lines.
+    """Return the lines of a COLMAP text file that begin an entry: those for which `first` is true. Comments and empty lines are left out.
 
     Raises ValueError if the file has fewer entries than its header says.
     """
@@ -229,9 +229,9 @@ def _text_images(file: Path) -> list[Image]:
 
 
 def _is_image(line: str) -> bool:
-    """Tell a line of an image from its line of keypoints, which may be empty, and which some programs leave out.
+    """Return True for the line of an image, False for the line of its keypoints. Some programs leave the keypoints' line out.
 
-    Keypoints are triples of numbers; an image ends in its name. Raises ValueError for a line that is neither.
+    The line of an image ends in its name. The line of keypoints has triples of numbers. Raises ValueError for a line that is neither.
     """
     values = line.split()
     try:

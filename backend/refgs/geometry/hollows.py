@@ -21,9 +21,10 @@ SMOOTH = 2  # cells: the votes of neighbours count, too
 def carve_hollows(alpha: np.ndarray, low: np.ndarray, voxel: np.ndarray, photos: Sequence[Photo]) -> np.ndarray:
     """Remove cells from a visual hull if photos see through them. Returns the fraction of each voxel that is left, (X, Y, Z) in 0..1.
 
-    `alpha` (X, Y, Z) is at least one half in the hull. Its first voxel has the corner `low` (3,) and the size `voxel` (3,), in world units.
-    A cell of the hull is empty if enough photos see a surface behind the cell (see `stereo.depth_maps`), and few photos see a surface in
-    it. The light must stand still. If it turns with the camera, highlights look like a surface on the axis of the turntable.
+    The hull is where `alpha` (X, Y, Z) is above one half. Voxels have the size `voxel` (3,), and the first has its corner at `low` (3,), in
+    world units. A cell is a cube of CELL³ voxels. It is empty if enough photos see a surface behind it (see
+    `stereo.depth_maps`), and few photos see a surface in it. The light must stand still. If it turns with the camera, highlights look like
+    a surface on the axis of the turntable.
     """
     shape = Shape(alpha > 0.5, np.asarray(low), np.asarray(voxel))
     cells = Shape(shape.solid[::CELL, ::CELL, ::CELL], shape.low, CELL * shape.voxel)

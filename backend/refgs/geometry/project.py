@@ -53,7 +53,7 @@ def remap(
 ) -> np.ndarray:
     """Interpolate an image at columns and rows `at` (H, W, 2) float32, by OpenCV's `remap`. Returns (H, W) or (H, W, C).
 
-    The centre of the first pixel is at (0, 0). `outside` is the first channel's value outside the image.
+    The centre of the first pixel is at (0, 0). Outside the image, the first channel is `outside`, and other channels are 0.
     """
     one_map = np.empty(0, np.float32)  # in place of a second map: `at` has both coordinates
     return cv2.remap(image, at, one_map, interpolation, borderMode=border, borderValue=(outside,))

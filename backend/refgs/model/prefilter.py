@@ -80,9 +80,9 @@ def _level_weights(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tup
     The pyramid is the cubemap and its mips. Mips with fewer than `coarsest` texels a side are not read. `side` is the side of the level in
     texels, and `lobe` is the filter as a function of the cosine.
 
-    Returns three arrays with an entry for each weight: the pyramid's texel, the level's texel in orbit order (`cubemap.orbit_order`), and
-    the weight. Of the pyramid, only the texels on face +x with s, t > 0 are listed. The weights of its other texels follow from the cube's
-    symmetries. Together, the listed and the other weights of a texel of the level sum to one.
+    Returns three arrays with an entry for each weight: the index of the pyramid's texel, the index of the level's texel in orbit order
+    (`cubemap.orbit_order`), and the weight. Only the pyramid's texels in one quarter of face +x are listed: the second half of its rows
+    and columns. The weights of all other texels follow from the cube's symmetries. All weights of a texel of the level sum to one.
     """
     axes = cubemap.texel_directions(side)[cubemap.orbits(side).flatten()].numpy()
     sides = _pyramid_sides(resolution)
@@ -110,7 +110,7 @@ def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, sid
     """Average a lobe over the area of each of P texels. Returns (P,).
 
     `axes` (P, 3) are unit directions: for each texel, the one in which the lobe points. The texels lie on face +x of a cubemap with `side`
-    texels a side. `row` and `column` (P,) are their places on the face, counted from its middle.
+    texels a side. `row` and `column` (P,) are their indices on the face; 0 is the first texel after its middle.
     """
     value = np.zeros(len(axes))
     x, y, z = np.ascontiguousarray(axes.T)
@@ -207,7 +207,7 @@ _Work = struct("Product", "sparse.cpp")
 
 
 def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tensor:
-    """Multiply a `Matrix` by `dense`: values (columns, 3) of texels in orbit order (`cubemap.orbit_order`).
+    """Multiply a `Matrix` by `dense` (columns, 3): the RGB of texels in orbit order (`cubemap.orbit_order`).
 
     The product is in orbit order, too. If `rows` is given, row i of the product is stored as row `rows[i]` of the result.
     """

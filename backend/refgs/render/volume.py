@@ -49,7 +49,7 @@ def shortest_last(rotations: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def with_normals_last(surfels: Surfels) -> Surfels:
-    """Reorder the axes of 3D Gaussians so that the normal is the third axis. For surfels it already is, so they are returned unchanged."""
+    """Reorder the axes of 3D Gaussians so that the normal is the third axis. Surfels have it there already, and are returned unchanged."""
     if surfels.scales.shape[1] == 2:
         return surfels
     rotations, scales = shortest_last(surfels.rotations, surfels.scales)

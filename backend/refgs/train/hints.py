@@ -31,7 +31,8 @@ def continue_with_hints(state: State, run: Path, hints: list[Hint]) -> None:
     """Take over what a finished `run` has learned, return to an earlier iteration, and hold the metallic of the hinted parts.
 
     Hinted metals start as a bright mirror, because the base colour that they had as plastic tells nothing. Hinted paint keeps its base
-    colour and roughness, because rough metal looks much like paint of its colour. The residual of all surfels starts anew.
+    colour and roughness, because rough metal looks much like paint of its colour. The residual (see `State.residual_start`) is
+    reset for all surfels.
 
     Raises InputError if the run has no checkpoint, or if its settings leave out metals.
     """

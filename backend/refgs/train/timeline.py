@@ -50,7 +50,7 @@ Test = Callable[[State, Step], bool]
 
 
 class When(NamedTuple):
-    """Hold a time or a condition. `holds` tells whether it has come, or is true. `words` describe it in docs/timeline.md."""
+    """Hold a time or a condition. `holds` returns True after the time, or while the condition is true. `words` are for docs/timeline.md."""
 
     words: str
     holds: Test
@@ -203,7 +203,7 @@ def even_by_logarithm(iteration: int) -> bool:
 def _late(state: State, part: float) -> float:
     """Return the progress (0..1) at which the fraction `part` of the residual's learning time is over.
 
-    The residual learns from `state.residual_start` to the end of the training.
+    The residual, a colour added to the shaded one, learns from `state.residual_start` to the end of the training.
     """
     return state.residual_start + part * (1 - state.residual_start)
 

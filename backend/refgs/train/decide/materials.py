@@ -81,7 +81,7 @@ class Specular(Need):
 
 
 def _learn_again(state: State, names: list[str]) -> None:
-    """Learn parameters that were left out. All surfels start with the settings' values."""
+    """Begin to learn the parameters `names`, which were left out before. All surfels start with the values in the settings."""
     start, count = start_appearance(state.effective.asked), state.learned.count
     for name in names:
         row = start[name].to(state.device)

@@ -101,5 +101,5 @@ def motion(one: LoadedView, other: LoadedView, radius: float) -> float:
 
 
 def _agreement(one: LoadedView, other: LoadedView) -> float:
-    """Compute the PSNR in dB between two photos of the same size, clipped to white."""
+    """Compute the PSNR in dB between two photos of the same size. Their encoded values are clipped to at most 1."""
     return psnr(*(np.minimum(view.encoded, 1) for view in (one, other)))

@@ -23,14 +23,14 @@ MIRROR_VIEWS = 24  # views that tell which part of the light the object mirrors
 
 
 class MirroredLight(Part):
-    """Remember which part of the light the object mirrors towards the cameras: the `weight` of each texel in the light's mean."""
+    """Keep the `weight` of each texel in `mean_radiance`: the fraction of mirroring pixels that mirror it."""
 
     name, saved = "light", ("weight",)
     weight: Tensor | None = None
 
 
 def start_value(state: State) -> float:
-    """Return the raw value, before activation, at which all texels of the light start."""
+    """Return the learned value of all texels of the light at the start. The activation turns it into the radiance in the settings."""
     return state.method.light.raw(state.settings.environment.radiance)
 
 

@@ -43,7 +43,7 @@ class TracedMesh(Part):
 
 @torch.no_grad()
 def make_mesh(state: State, step: Step) -> None:
-    """Make a new mesh from the surfels to trace on. Measure which fraction of the object mirrors the object (`step.hidden`)."""
+    """Make a mesh of the surfels, to trace rays on. Set `step.hidden` to the fraction of the object's pixels that mirror the object."""
     if why_not_traced(state):
         return
     with state.clock.part("visibility"):
@@ -74,7 +74,7 @@ def make_mesh(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def trace_received(state: State, step: Step) -> None:
-    """Trace how much of the light each surfel receives. Called for each new mesh, because mesh and light improve during the training."""
+    """Trace which fraction of an unoccluded surface's irradiance each surfel receives. Done again for each new mesh."""
     if state.occluder is None or "received" not in state.learned:
         return
     traced = Surfels(*(value.cpu() for value in with_normals_last(state.surfels())))

@@ -2,8 +2,8 @@
 
 Base colour and roughness that differ from surfel to surfel explain the shading of an embossed metal as well as normals do, and they learn
 faster. So both are averaged over neighbours of coloured metal until late in the training, and normals must explain finer detail. After
-that, the photos add what normals do not explain, such as dirt in the hollows. Grey metals are left alone: print, brushing and tarnish are
-real patterns on them, coloured or grey.
+that, the photos add what normals do not explain, such as dirt in the hollows. Grey metals are left alone, because they may have real
+patterns, coloured or grey: print, brushing and tarnish.
 """
 
 import torch

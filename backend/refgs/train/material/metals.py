@@ -42,18 +42,18 @@ class Metals(Part):
 
 
 def find_metals(state: State, step: Step) -> None:
-    """Once, early in the training, raise the metallic of the surfels that change with the view as only metals do.
+    """Once, early in the training, raise the metallic of surfels whose colour changes with the view as only that of metals does.
 
     `shines_as_metal` finds coloured metals, and `falls_as_metal` finds metals of any colour. Two findings rule metal out, and lower the
     metallic that was learned so far:
 
-    - A light that changed from photo to photo explains the changes far better than mirroring does (see `changing_light.explained`). Then
+    - The changes fit a light that differs between photos far better than they fit mirroring (see `changing_light.explained`). Then
       nothing is metal.
-    - Neither explains the changes of coloured surfels. Then nothing coloured is metal. Fur is an example: it hides and shows what is
+    - The changes of coloured surfels fit neither of the two. Then nothing coloured is metal. Fur is an example: it hides and shows what is
       below it, which has the same colour.
 
-    If nearly all surfels shine as coloured metals do, all are metal from then on (see `hold`). Faint shining is enough if mirroring
-    explains the changes. Otherwise, surfels that are not found keep their metallic, which started low, as that of a dielectric.
+    If nearly all surfels shine as coloured metals do, all are metal from then on (see `hold`). Faint shining is enough for this if
+    their changes fit mirroring. Otherwise, surfels that are not found keep their metallic, which started low, as that of a dielectric.
 
     If most of the coloured surface shines, dark parts may be metal as well, such as patina. Then the loss term `loss.dark` ends.
 
