@@ -219,8 +219,8 @@ def _install(home: Path, uv: Path, trainer: Path) -> None:
 def _choose_lock(program: Path, variables: dict[str, str], home: Path, locks: Path) -> Path:
     """Return the lock for the build of torch that uv chooses for this machine.
 
-    A build is named at the end of torch's version, such as 2.14.0+cpu. The package index's build has no name, and its lock is lock.txt.
-    UV_TORCH_BACKEND in `variables` is set to the build. It is removed if the build has no lock of its own; then lock.txt is returned.
+    A build is named at the end of torch's version, such as 2.14.0+cpu. If there is a lock for that build, return it, and store the build's
+    name in `variables` as UV_TORCH_BACKEND. Otherwise return lock.txt, which is for the package index's build, and delete UV_TORCH_BACKEND.
     """
     lock, wanted = locks / "lock.txt", home / "torch.txt"
     if "UV_TORCH_BACKEND" not in variables or not (pinned := re.search(r"^torch==\S+", lock.read_text(), re.M)):

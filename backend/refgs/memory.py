@@ -16,7 +16,7 @@ LESS = "close other programs, or ask for less: smaller photos, fewer surfels, sm
 
 
 def trim() -> None:
-    """Return freed memory to the system. glibc keeps up to gigabytes after tensors of a few megabytes have been freed.
+    """Return freed memory to the system. When thousands of tensors have been freed, glibc may still keep gigabytes for later.
 
     On other systems, nothing is done.
     """

@@ -58,9 +58,9 @@ class OnJob(ReportsErrors):
 
 
 class OnCapture(ReportsErrors):
-    """Disable the operator's button without a capture or a trainer; its tooltip then says what to do.
+    """Base class of operators on the scene's capture, the folder with the photos.
 
-    Base class of the operators on the scene's capture, the folder with the photos.
+    Their buttons are disabled while no folder is chosen or the trainer is not installed. The tooltip then says what to do.
     """
 
     @classmethod

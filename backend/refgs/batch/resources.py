@@ -8,7 +8,7 @@ BASE, PER_PIXEL, PER_SURFEL = 0.85e9, 850.0, 5000.0  # bytes: libraries; of a ph
 
 
 def memory(settings: Settings) -> int:
-    """Estimate the peak memory of a training in bytes. On a GPU, about as many bytes of the card's memory are used."""
+    """Estimate the most main memory in bytes that a training takes. A training on a GPU takes about as much of the GPU's memory, too."""
     return int(BASE + PER_PIXEL * settings.image.max_side**2 + PER_SURFEL * settings.surfels.budget)
 
 

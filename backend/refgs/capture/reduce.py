@@ -107,5 +107,5 @@ def _area_weights(rows: slice, source: slice, ratio: float) -> np.ndarray:
 
 @cache
 def _decoding_table(largest: int, white: int) -> np.ndarray:
-    """Return a table from the sRGB codes 0 to `largest` to linear radiance, float32. `white` is the code of radiance 1."""
+    """Return the linear radiance, float32, of each sRGB code from 0 to `largest`. `white` is the code whose radiance is 1."""
     return srgb_decode(np.arange(largest + 1) / white).astype(np.float32)

@@ -88,13 +88,13 @@ def read_images(file: Path) -> list[Image]:
 
 def count_images(file: Path) -> int:
     """Count a COLMAP model's images, as `read_images` would read them. Raises InputError for a broken file."""
-    return _parse(file, lambda file: _Reader(file).take("Q")[0], lambda file: len(_text_images(file)))
+    return _parse(file, _binary_count, lambda file: len(_text_images(file)))
 
 
 def read_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read the points (M, 3) of a COLMAP model and their colours (M, 3), sRGB-encoded in 0..1. Raises InputError for a broken file.
 
-    Points with a value that is NaN, infinite or beyond FARTHEST are left out: no camera is there.
+    Points with a value that is NaN, infinite or beyond FARTHEST are left out: such points are mistakes.
     """
     return _parse(file, _binary_points, _text_points)
 
@@ -145,6 +145,11 @@ class _Reader:
                 raise ValueError("one identifier twice")
             last = number
             yield number
+
+
+def _binary_count(file: Path) -> int:
+    with open_file(file) as opened:
+        return _Reader(opened).take("Q")[0]
 
 
 def _binary_cameras(file: Path) -> dict[int, Intrinsics]:

@@ -74,7 +74,7 @@ class Frame(Intrinsics):
 
 
 class _Cameras(Model):
-    """Hold the `frames` of a file. Values that all frames share are in each frame."""
+    """Hold the `frames` of a file. Intrinsics that the file gives once, for all frames, are copied into each frame."""
 
     @model_validator(mode="before")
     @classmethod

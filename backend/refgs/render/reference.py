@@ -264,8 +264,8 @@ def _cube_margins(directions: Tensor, sides: list[Tensor], margins: list) -> Non
 def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor, margins: list) -> Tensor:
     """Look up the prefiltered light in P unit directions (P, 3), for roughnesses (P,). Returns the radiance (P, 3).
 
-    `levels` are what `prefilter` returns, with the sides `sides`. At some values, derivatives jump. The distances from these values are
-    appended to `margins` (see `shade`).
+    `levels` are what `prefilter` returns, with the sides `sides`. Radiance is interpolated, so that its derivatives jump where a look-up
+    passes from one texel or level to the next. How far each look-up is from there is appended to `margins` (see `shade`).
     """
     known, alpha = torch.tensor(prefilter.ROUGHNESS, dtype=roughness.dtype), roughness**2
     interval = (torch.bucketize(roughness.detach().contiguous(), known) - 1).clamp(0, len(known) - 2)

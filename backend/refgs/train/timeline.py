@@ -101,7 +101,7 @@ class Row(NamedTuple):
 
 
 def part(of: float) -> When:
-    """Return the time when the fraction `of` of the training is over."""
+    """Return the time at which the training has reached the progress `of`, 0..1."""
     return When(f"{of:.0%}", lambda state, step: step.progress >= of)
 
 

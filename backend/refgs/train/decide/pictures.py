@@ -1,4 +1,4 @@
-"""Write pictures of a training view with and without an optional part of the training, when the training decides whether to keep the part.
+"""Write a training view as rendered with a feature and without it, when a training decides whether the scene needs this feature.
 
 The pictures show the artist what a decision of `refgs.train.decide.needs` is about. They are in the run folder, in `needs/`.
 """

@@ -17,9 +17,9 @@ RENAMED = {
 
 
 def as_of_today(tensors: dict[str, Tensor], facts: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Return the tensors and facts of a checkpoint in today's form.
+    """Convert the tensors and facts of a checkpoint of release 0.1.0 to today's form. Return those of later releases unchanged.
 
-    In release 0.1.0, a metallic with a special value (HELD) marked a surfel as held. The facts of each `Part` had top-level keys.
+    0.1.0 marked surfels whose metallic must not learn by special values of it (HELD), and stored all parts' facts in one flat table.
     """
     if "residual" in facts:
         return tensors, facts

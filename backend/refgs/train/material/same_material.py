@@ -88,9 +88,9 @@ def doubt(surfels: Surfels, seen: Seen, fit: Fit) -> Tensor:
 
 
 def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray, np.ndarray]:
-    """Return four things: the Laplacian (N, N), which surfels take part (N,), and the evidence for metal (N,) and paint (N,).
+    """Return the Laplacian (N, N) of neighbouring surfels, which surfels can be judged (N,), and evidence for metal and for paint (N,).
 
-    A surfel takes part if photos show it in more than FRINGE pixels. Evidence lies between 0, for none, and SURE.
+    A surfel can be judged if photos show it in more than FRINGE pixels. Evidence lies between 0, for none, and SURE.
     """
     graph, part = _laplacian(surfels.positions, seen), (seen.pixels > FRINGE).double().numpy()
     ratio = np.asarray((fit.ratio.clamp(1e-3, 1e3).log().double() * fit.seen).numpy())
