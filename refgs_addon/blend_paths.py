@@ -77,7 +77,7 @@ def _after_loading(*_) -> None:
 
 @bpy.app.handlers.persistent
 def _after_appending(context, *_) -> None:
-    """Make the paths of what was appended from another .blend absolute. All others are absolute."""
+    """Make the paths of data appended from another .blend absolute. Those are relative to that file; all others are absolute already."""
     libraries = [item.source_library for item in context.import_items if item.source_library is not None]
     if libraries:
         start = os.path.dirname(bpy.path.abspath(libraries[0].filepath))

@@ -180,8 +180,8 @@ def read_bytes(file: Path) -> bytes:
 def disk_errors_named(folders: list[Path], again: str) -> Iterator[None]:
     """Raise TryAgain for disk errors in a `with` block. The message names the folder whose disk is full, read-only or gone.
 
-    The block writes to `folders`, which must exist. If `folders` is empty, the message also allows for a failed read. The message contains
-    `again`, which tells the user how to continue when the disk works again.
+    The block writes to `folders`, which must exist. If `folders` is empty, the message says that the disk "cannot be read or written". The
+    message contains `again`, which tells the user how to continue when the disk works again.
     """
     try:
         yield

@@ -84,7 +84,10 @@ def write_asset(run: Path, picture: Path | None, file: Path) -> None:
 
 
 def add_catalog(library: Path) -> None:
-    """List the catalog in a library's file of catalogs, beside those that the artist has added there."""
+    """Add the catalog "RefGS" to the file in which Blender finds the catalogs of `library`. Catalogs added by the artist stay.
+
+    Raises InputError if the file cannot be written.
+    """
     file = library / _CATALOGS
     try:
         text = file.read_text(encoding="utf-8") if file.exists() else _HEADER

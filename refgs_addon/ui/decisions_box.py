@@ -20,7 +20,7 @@ PICTURE = 0.11  # lines of height for each letter of width: pictures fill a thir
 
 
 class _OnDecision(OnRunFolder):
-    """Store a run's folder and the name of a need. Base class of the operators on one decision."""
+    """Store a run's folder, and in `need` which of its decisions an operator works on. Base class of these operators."""
 
     need: StringProperty(name="Need")
 

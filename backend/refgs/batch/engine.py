@@ -65,15 +65,16 @@ class Engine:
         self.cards = int(max(node.get("GPU", 0) for node in nodes))
 
     def card_bytes(self) -> int:
-        """Return the memory in bytes of one of the cluster's CUDA cards. Ray chooses which."""
+        """Return the memory of a CUDA card of the cluster, in bytes. If the cluster has several cards, Ray chooses one of them."""
         return self._ray.get(self._ray.remote(_card_bytes).options(num_gpus=0.01).remote())
 
     def submit(self, step: Step, memory: int, card: float, before: list[tuple[Any, bool]]) -> Any:
         """Hand a step to Ray. Returns a reference to its outcome.
 
         `memory` is the memory that the step needs, in bytes. It is limited to nine tenths of the memory of the largest machine. `card` is
-        the step's share of a CUDA card, 0 … 1. `before` has a pair for each step that this step waits for: its reference or outcome, and
-        whether it is optional.
+        the step's share of a CUDA card, 0 … 1. `before` has a pair for each step that this step waits for. The first entry is the
+        reference that this method returned for that step, or its outcome if it ended in an earlier batch. The second is true if this step
+        may run although that step failed.
         """
         how = {
             "num_cpus": self._cores,
@@ -90,9 +91,9 @@ class Engine:
         return reference
 
     def ended(self, seconds: float) -> Iterator[tuple[Step, Outcome]]:
-        """Wait for a step to end, at most for `seconds`. Yields every step that has ended, and its outcome.
+        """Wait until a step ends, but not longer than `seconds`. Then yield each step that has ended, with its outcome.
 
-        Raises TryAgain if Ray's head has died.
+        Each step is yielded once. If no step has ended, none is yielded. Raises TryAgain if Ray's head has died.
         """
         if not self._steps:
             return
@@ -140,10 +141,10 @@ class Engine:
 
     @contextmanager
     def lending(self, folder: Path) -> Iterator[None]:
-        """Let other machines copy the files of all steps during a `with` block. `folder` is the folder of the batch's logs.
+        """Let steps on other machines work on copies of this machine's files during a `with` block. `folder` is that of the batch's logs.
 
-        A machine that shares `folder` needs no copies. The copies are removed after the block. If the block raises an error, they stay for
-        the next batch.
+        A machine that can see `folder` itself, as on a network disk, makes no copies. The copies are removed after the block. If the block
+        raises an error, they stay for the next batch.
         """
         for old in folder.glob(f"{MARK}*"):
             old.unlink()
@@ -207,10 +208,10 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
 
 
 def _keep_ignoring(ray: Any) -> None:
-    """Ignore SIGTERM until the end of Ray's shutdown.
+    """Make Ray's shutdown ignore SIGTERM to its end. The caller has set SIGTERM to be ignored.
 
-    When Ray closes its log, it restores the system's handler of SIGTERM, which ends the process. So SIGTERM is ignored once more after
-    that.
+    But when Ray closes its log, it restores the system's handler of SIGTERM, which ends the process. So this function lets Ray set
+    SIGTERM to be ignored again, before Ray ends its own processes.
     """
     node = ray._private.worker._global_node
     if node is None or threading.current_thread() is not threading.main_thread():
@@ -260,7 +261,11 @@ def _make_folder() -> Path:
 
 
 def _import_ray(cluster: bool) -> Any:
-    """Import Ray, after setting the environment variables that it reads on import."""
+    """Set the environment variables that Ray reads on import. Then import Ray, and return the module.
+
+    If `cluster` is false, a new random token keeps others from using the Ray that starts on this machine. Raises InputError if Ray is
+    missing or has another version than VERSION.
+    """
     os.environ.update({name: value for name, value in ENVIRONMENT.items() if name not in os.environ})
     if not cluster:  # nobody else may use this Ray, and no token need be kept for it
         os.environ.update({"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)})

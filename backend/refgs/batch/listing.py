@@ -30,7 +30,7 @@ class Ask(BaseModel):
     set: list[str] = []
 
     def under(self, above: "Ask") -> "Ask":
-        """Return the options of this line. Where it has none, take those of the line `above`."""
+        """Return these options, completed by those of the level `above`: `preset` and `minutes` where they are None, and all of `set`."""
         preset, minutes = self.preset or above.preset, self.minutes or above.minutes
         return Ask(preset=preset, minutes=minutes, set=[*above.set, *self.set])
 
@@ -122,9 +122,9 @@ def _beside(file: Path, name: str) -> Path:
 
 
 def _check_unique(source: Path, out: Path, jobs: list[Job]) -> None:
-    """Check that each run's name can be a folder's, that no capture is listed twice, and that no two trainings have one run folder.
+    """Raise InputError if a run's name cannot be a folder's name, if a capture is listed twice, or if two trainings share a run folder.
 
-    Raises InputError.
+    The message names `source`, the list or folder of captures. `out` is the folder of all runs.
     """
     names: dict[Path, str] = {}
     runs: dict[str, Job] = {}

@@ -102,7 +102,11 @@ class LoadedView:
 
 
 class Header(NamedTuple):
-    """Hold an image's size as stored, in pixels, whether it has alpha, and the clockwise quarter turns that make it upright (EXIF)."""
+    """Hold facts from the header of an image file.
+
+    `width` and `height` are the size of the stored image in pixels. `has_alpha` tells whether it has transparency. `turns` is the number of
+    clockwise quarter turns that make it upright, by its EXIF.
+    """
 
     width: int
     height: int
@@ -154,9 +158,9 @@ def read_image(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.n
     """Decode an image file to RGB (H, W, 3) uint8 and alpha (H, W) uint8, None without alpha.
 
     The image is turned upright by its EXIF orientation. Greyscale files and those with more than 8 bits are converted to 8-bit RGB.
-    `shrink` may be 2, 4 or 8: a JPEG's sides are divided by it. If it does not divide them evenly, it is halved until it does. A RAW
-    photo's sides are halved at most. Colours are converted to sRGB by the file's profile. With `is_data`, as for normals, codes stay as
-    stored. Raises InputError naming the file if it is truncated or unreadable.
+    `shrink` is 1, 2, 4 or 8: a JPEG's sides are divided by it. If one side is not divisible by `shrink`, then `shrink` is first halved
+    until both are. A RAW photo's sides are halved at most. Colours are converted to sRGB by the file's profile. With `is_data`, as for
+    normals, codes stay as stored. Raises InputError naming the file if it is truncated or unreadable.
     """
     image, alpha, white = read_codes(path, shrink, is_data)
     return as_bytes(image, white), alpha
@@ -211,8 +215,8 @@ def _exr_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 def write_for_colmap(path: Path, out: Path) -> bool:
     """Write a photo's pixels to the JPEG `out` if COLMAP may not read them: HEIC, RAW, EXR and others, or TIFF not stored upright.
 
-    Return whether the JPEG was written. It has the orientation in which `Header` says that the pixels are stored. Raises InputError naming
-    the file.
+    Return whether the JPEG was written. Its pixels are not turned upright: its size is the `width` and `height` of the photo's `Header`.
+    Raises InputError naming the file.
     """
     if _is_raw(path) or _is_exr(path):
         stored = np.rot90(read_image(path)[0], read_header(path).turns)
@@ -231,10 +235,10 @@ def write_for_colmap(path: Path, out: Path) -> bool:
 def read_mask(path: Path, below: float | None = None) -> np.ndarray:
     """Read a mask file as (H, W) uint8: 255 is the object, 0 the background.
 
-    If the file has an alpha channel that is not opaque everywhere, the alpha channel is the mask. Otherwise the brightness is the mask. Of
-    two values of any kind, the smaller is the background and the larger the object. In a coloured palette the smallest index is the
-    background, and all others are objects. If `below` is given, the file is a depth map instead: the object is where depth is less than
-    `below` times the largest possible value.
+    If the file has an alpha channel that is not opaque everywhere, the alpha channel is the mask. Otherwise the brightness is the mask. If
+    the mask has only two different values, such as 0 and 1, the smaller is the background and the larger the object. In a coloured palette,
+    the smallest index is the background, and all other indices are objects. If `below` is given, the file is a depth map instead: the
+    object is where depth is less than `below` times the largest possible value.
     """
     if below is not None:
         return np.where(read_image(path, is_data=True)[0][..., 0] < 255 * below, np.uint8(255), np.uint8(0))
@@ -253,8 +257,8 @@ def read_mask(path: Path, below: float | None = None) -> np.ndarray:
 def _stored_numbers(path: Path) -> np.ndarray | None:
     """Read the numbers (H, W) that a mask's file stores, upright, without decoding them as colours.
 
-    These are the codes of a black-and-white or grey picture, two 32-bit numbers, or True where a coloured palette's index is an object.
-    Programs that segment photos write such files. Return None for other pictures.
+    These are the codes of a black-and-white or grey picture. For a coloured palette, True stands for all indices but the smallest that
+    occurs. For 32-bit numbers, they are these numbers, of which there are at most two different ones. Returns None for any other file.
     """
     if _is_raw(path) or _is_exr(path):
         return None
@@ -293,7 +297,7 @@ def read_alpha(view: View) -> np.ndarray | None:
 
 
 def _file_mask(view: View, file: Path) -> np.ndarray:
-    """Read a view's mask from its file, as `read_alpha` does."""
+    """Read the mask (H, W) uint8 of a view from `file`. If its size is not the upright photo's, turn it as the photo's EXIF says."""
     mask = read_mask(file, view.mask_below)
     if mask.shape != (view.camera.height, view.camera.width):
         mask = np.rot90(mask, -read_header(view.image_path).turns).copy()  # torch takes no negative strides

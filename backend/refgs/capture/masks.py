@@ -166,9 +166,9 @@ def with_masks(
 def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, float]:
     """Guess a box around the object: a cube around the point at which the cameras look.
 
-    `views` are the capture's views, without the masks that the caller wants to ignore. Returns the box, the fraction of the box's edges
-    that the object is likely to fill, and the radius of the region of interest. Raises InputError if the cameras look outwards, as in a
-    room.
+    `views` are the capture's views. If a view has a mask, the guess uses it. Returns the box, the fraction of each of its edges that the
+    object is likely to fill, and the radius of the region of interest in the capture's units. Raises InputError if the cameras look
+    outwards, as in a room.
     """
     found = find_region(views, up_direction(views), capture.points, [])
     if found.because == LOOK_OUT:
@@ -353,9 +353,10 @@ def _to_photo(view: View, mask: np.ndarray) -> np.ndarray:
 
 
 def _put(files: dict[Path, Path], root: Path, before: set[str]) -> None:
-    """Move the new masks to their places, and record their hashes.
+    """Move the new masks to their places, and record their hashes in masks/made.json.
 
-    The hashes are recorded first. So after an interruption, no mask of the program is taken for the artist's.
+    `files` maps each temporary file to its place. `before` are the hashes recorded so far. They stay recorded, together with the new ones,
+    until all masks are moved. So after an interruption, no mask of the program is taken for the artist's.
     """
     (root / "masks").mkdir(exist_ok=True)
     now = {_hash(path) for path in files}

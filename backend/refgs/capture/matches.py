@@ -33,11 +33,11 @@ class Matches(NamedTuple):
 
 
 def match_neighbours(views: list[LoadedView]) -> list[Matches]:
-    """Match some photos, evenly spread, each with the photo of the nearest camera. Only pixels inside the masks are matched.
+    """Match the features of some photos, evenly spread, each with the photo of the nearest camera. Use only pixels inside the masks.
 
-    The matches of a pair fit one epipolar geometry, which is found from the matches alone and not from the cameras. Pairs with fewer than
-    LEAST matches are left out. So are pairs of which most matches fit no common epipolar geometry: the few that fit one may do so by
-    chance. Matches of mirror images may remain, although mirror images move over the surface when the camera moves.
+    For each pair of photos, an epipolar geometry is fitted to the matches, without using the cameras. Matches that do not fit it are
+    dropped. A pair is left out if most of its matches do not fit, because the others may fit by chance. A pair with fewer than LEAST
+    matches is left out, too. Matches of reflections may remain, although reflections move over the surface when the camera moves.
     """
     if len(views) < 2:
         return []
@@ -57,7 +57,8 @@ def pixels_apart(matches: list[Matches], cameras: list[Camera]) -> float | None:
     """Return how far matches are from their epipolar lines, in pixels of photos reduced to SIDE.
 
     The result is the lower quartile of the pairs' medians, or None if there are fewer than LEAST_PAIRS pairs. A mean would be too high,
-    because matches of mirror images contradict even correct cameras. `cameras` are those of the matched views, in the same order.
+    because matches of reflections in the object are wrong even for correct cameras. `cameras` are those of the matched views, in the same
+    order.
     """
     medians = []
     for pair in matches:

@@ -235,7 +235,7 @@ def _histogram(bins: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def _hidden(prior: np.ndarray) -> np.ndarray:
-    """Mark the pixels (H, W) at which the object may hide the plane: the shape's projection with a margin."""
+    """Mark the pixels, bool (H, W), at which the object may hide the plane: the shape's projection `prior` (H, W), with a margin."""
     margin = max(3, round(0.02 * max(prior.shape))) | 1
     return cv2.dilate((prior > 0.3).astype(np.uint8), np.ones((margin, margin), np.uint8)) > 0
 
@@ -246,10 +246,11 @@ def _plain(photo: Photo, prior: np.ndarray, backdrop: Backdrop | None) -> np.nda
 
 
 def _surroundings(ours: np.ndarray, theirs: np.ndarray, plain: np.ndarray | None) -> np.ndarray:
-    """Return the likelihood of each pixel's colour in the surroundings, (H, W).
+    """Return the likelihood of each pixel's colour if the pixel shows the surroundings, (H, W).
 
-    `ours` and `theirs` (H, W) are its likelihoods by the histograms of the object and of the surroundings. `plain` is the result of
-    `Backdrop.likelihood`, or None without a plane. Where it is NaN, the result is `theirs`.
+    `ours` and `theirs` (H, W) are the colour's likelihoods by the histograms of the object and of the surroundings. `plain` is the result
+    of `Backdrop.likelihood`. If it is None, or where it is NaN, the result is `theirs`. Where it is negative, it holds odds, and the result
+    is `ours` divided by these odds. Elsewhere the result is mostly `plain`.
     """
     if plain is None:
         return theirs

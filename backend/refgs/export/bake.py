@@ -24,9 +24,9 @@ _NEIGHBOURS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, 
 def bake(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress = lambda done, total: None) -> Textures:
     """Bake the textures of a mesh, `size` texels on each side, from the splats around it.
 
-    Each texel has a point on the mesh. At this point, `composite` computes base colour, metallic, roughness and normal, and doubt if the
-    splats have that value. `openness` computes occlusion. A texel just outside a chart (a connected piece of the uv layout) has a point on
-    the plane of the nearest face. `progress` is called with the number of points done and their total.
+    Each texel has a point on the mesh. At this point, `composite` computes base colour, metallic, roughness and normal. If the splats have
+    doubt, it also computes doubt. `openness` computes occlusion. A texel just outside a chart (a connected piece of the uv layout) has a
+    point on the plane of the nearest face. `progress` is called with the number of points done and their total.
     """
     coarse = _composited(mesh, splats, size, progress)
     tangents, signs = vertex_tangents(mesh)
@@ -53,9 +53,10 @@ def bake(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress = la
 
 
 def _composited(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:
-    """Composite the splats' values at the texels of a texture. Returns (C, C, K), with the K values of `composite`.
+    """Composite the splats at each texel of a texture with C × C texels. Returns the K values of `composite` for each: (C, C, K).
 
-    C is smaller than `size` if the splats are large: FINE texels per standard deviation of a splat are enough.
+    C is at most `size`. It is smaller if the splats are large, so that a texel is not much finer than 1/FINE of a splat's standard
+    deviation.
     """
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()

@@ -21,7 +21,7 @@ class Said(Model):
 class Metrics(Model):
     """Hold the texts in metrics.json, which say what photos cannot tell apart.
 
-    `ambiguities` are changes of light and materials that cancel in all pictures. `doubt` is about metal and paint.
+    `ambiguities` are changes of light and materials that cancel in all pictures. `doubt` is about surfaces that may be metal or paint.
     """
 
     ambiguities: dict[str, Said] = Field(default_factory=dict)

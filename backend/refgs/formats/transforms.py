@@ -37,7 +37,7 @@ class Intrinsics(Model):
 
     @property
     def lens_keys(self) -> dict[str, Any]:
-        """Return all that the file says of the lens besides `camera_model` and `is_fisheye`: each key that is named like it."""
+        """Return the file's other keys about the lens, with their values. A key counts if its name says so, such as `k1` or `lens_type`."""
         return {key: value for key, value in (self.model_extra or {}).items() if _of_lens(key)}
 
 
@@ -88,7 +88,10 @@ class _Cameras(Model):
 
 
 class Transforms(_Cameras):
-    """Hold the cameras of a file, and the values that only nerfstudio, instant-ngp or a run writes."""
+    """Hold the cameras of a file, and three things that only some programs write. These are None if the file lacks them.
+
+    They are the names of the training, test and validation photos, the path of a point cloud, and the matrix `to_capture`.
+    """
 
     frames: list[Frame]
     train_filenames: list[str] | None = None

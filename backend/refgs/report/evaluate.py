@@ -39,11 +39,11 @@ Step = Callable[[int, str, int], None]
 def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None, step: Step) -> dict[str, Any]:
     """Compare a run with the photos of `views`, and with ground truth if it is given. Returns the metrics for metrics.json, such as PSNR.
 
-    If the ground truth is of a published data set, the run is also measured by that data set's protocol (`refgs.report.published`). Only
-    the protocol then renders views under other lights.
+    If the ground truth is of a published data set, the run is also measured by that data set's protocol (`refgs.report.published`). In this
+    case, the views under other lights are those that the protocol asks for, and no others.
 
-    Writes pictures into the run's folder: of the views to pictures/`split`, of the light to pictures/, and of the views under other lights
-    to pictures/relight. `split` is "test" for held-out views. After each rendering, `step` is called with the number of renderings that are
+    Writes pictures to folders in the run's folder: the views to pictures/`split`, the light to pictures, and views under other lights to
+    pictures/relight. `split` is "test" for held-out views. After each rendering, `step` is called with the number of renderings that are
     done, a note, and their total number.
     """
     pictures, lit = run.folder / "pictures", run.environment is not None
@@ -185,7 +185,10 @@ def _measure_relit(
 
 
 def _measure_speed(run: Run, cameras: list[Camera]) -> dict[str, float | str]:
-    """Measure the frames per second of the renderer, by the median time of a frame. Runs on the CUDA card if there is one."""
+    """Measure how fast the renderer is. It runs on a CUDA card if one can be used, else on the CPU.
+
+    Returns two metrics: `frames_per_second`, by the median time of a frame, and `frames_device`, the card's name or "cpu".
+    """
     device = torch.device("cuda" if cuda.unusable() is None else "cpu")
     surfels = Surfels(*(value.to(device) for value in run.surfels()))
     light = run.environment and Environment(run.environment.radiance.to(device), run.environment.reference)

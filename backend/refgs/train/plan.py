@@ -82,7 +82,8 @@ class Plan:
     def begin(self, iteration: int, growth: float, stages: tuple[Stage, ...] = FULL) -> None:
         """Start measuring the pace of iterations.
 
-        An iteration at the end is expected to take `growth` times as long as one at the start on full photos. `stages` are the training's.
+        The last iteration is expected to take `growth` times as long as the first, if both are on full photos. `stages` are all stages of
+        the training. `iteration` is the one that comes next.
         """
         self._growth, self._stages, self._marks = growth, stages, [(iteration, self.spent)]
 

@@ -51,8 +51,8 @@ class RenderInputs(NamedTuple):
 class State:
     """Hold the state of a training: the capture, what it learns, and the decisions that it has made.
 
-    The constructor only reads the photos; `train/setup.py` makes the surfels, and `train/trainer.py` trains them. A fact that only one part
-    of the training needs is in that part's own memory, `part(Kind)`.
+    The constructor only reads the photos; `train/setup.py` makes the surfels, and `train/trainer.py` trains them. A fact that only one
+    module of the training needs is in that module's own `Part` object, which `part` returns.
     """
 
     def __init__(
@@ -79,11 +79,11 @@ class State:
         self.parts: dict[type, Any] = {}
 
     def part(self, kind: type[P]) -> P:
-        """Return the `Part` object of the class `kind`: the memory of one part of the training (see `train/part.py`)."""
+        """Return the object of the class `kind`, in which one module of the training keeps its own facts (see `train/part.py`)."""
         return self.parts[kind]
 
     def needed(self, name: str) -> bool:
-        """Tell whether the scene needs an optional part of the training. True until that is decided (see `train/decide`)."""
+        """Tell whether the scene needs the optional feature `name`, such as "exposure". True until that is decided (see `train/decide`)."""
         return name not in self.needs or self.needs[name].needed
 
     @property
@@ -161,7 +161,7 @@ class State:
         return self.picture(inputs if surfels is None else inputs._replace(surfels=surfels), camera)
 
     def photo(self, view: int, whole: bool = False) -> Photo:
-        """Return a view's photo in full size, cropped to what the training uses, or the whole photo if `whole` is true."""
+        """Return a view's photo, not reduced. It is cropped to the pixels that the training uses, unless `whole` is true."""
         photo = self.photos[view]
         return photo if whole or self.crops is None else photo.part(*self.crops[view])
 

@@ -14,10 +14,10 @@ LEAST_GROWTH = 2  # even the smallest object may get this many times the surfels
 
 
 class ObjectSize(NamedTuple):
-    """Hold the object's size in the full photos, in pixels: medians over views. `span` and `area` are 0 if a photo has no mask.
+    """Hold the object's size in pixels of the photos as loaded: medians over views. Both values are 0 if a photo has no mask.
 
-    `span` is the longer side of a mask's bounds, and `area` is the number of pixels in the mask. If the user set a region to train, the
-    ball around the region limits both.
+    `span` is the longer side of a mask's bounds, and `area` is the number of pixels in the mask. If the user set a region to train, they
+    are at most the diameter and the area of a circle: the ball around the region, as the photo shows it.
     """
 
     span: float

@@ -68,12 +68,12 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
 
 
 def _without_unlearned(surfels: Surfels, state: State) -> Surfels:
-    """Drop the residual if the training ended before it could learn."""
+    """Drop the surfels' residual colour (see `State.residual_start`) if the training ended before the residual could learn."""
     return surfels if surfels.sh_rest.any() else surfels.without_directions()
 
 
 def _without_untraced(surfels: Surfels, state: State) -> Surfels:
-    """Drop inter-reflection if the training has traced none."""
+    """Drop the surfels' values of inter-reflection if the training has made no mesh to trace it on."""
     if state.occluder is not None:
         return surfels
     nothing, whole = surfels.indirect_dc[:, :0], torch.ones_like(surfels.received)
@@ -179,7 +179,7 @@ def _seen_side(surfels: Surfels, state: State) -> Tensor:
 
 
 def _needs_rows(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) -> list[dict[str, Any]]:
-    """Make the rows of needs.json: which parts of the training were used or left out, each with the reason and what leaving it out saved.
+    """Make the rows of needs.json. Each tells what the training left out, or decided to keep, and why, and what leaving it out saved.
 
     `side` (N,) is the result of `_seen_side`. `wanted` (N,) is true for surfels in the region to train.
     """

@@ -30,7 +30,7 @@ class Means(Part):
         self.values = dict(facts)
 
     def add(self, figures: Mapping[str, Tensor]) -> None:
-        """Add the figures of an iteration. A graphics card need not have computed them yet."""
+        """Add the figures of an iteration to the means. This does not wait for a graphics card that is still computing the figures."""
         self.values = {name: running(self.values.get(name, figure), figure) for name, figure in figures.items()}
 
     @property

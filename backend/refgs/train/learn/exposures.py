@@ -17,7 +17,7 @@ BALANCED = 0.1  # largest difference of a channel's logarithm that may still be 
 
 
 class Exposures(Part):
-    """Hold EXPOSURE as a tensor on the training's device."""
+    """Hold EXPOSURE as the tensor `basis` (3, 3) on the training's device: the rows that `exposure` sums with learned weights."""
 
     name = "exposures"
 
@@ -26,11 +26,11 @@ class Exposures(Part):
 
 
 def exposure(state: State, view: int | slice) -> Tensor | None:
-    """Compute a view's exposure (3,): factors of its rendered red, green and blue. Return None if exposures are not learned.
+    """Return a view's exposure (3,): factors for its rendered red, green and blue. Return None if exposures are not learned.
 
     The training learns a weight for each row of EXPOSURE. The weighted sum of the rows is the natural logarithm of the factors. With only
-    one weight per view, all photos have the same white balance, and a view's three factors are equal. A slice of views gives the exposures
-    of all of them (V, 3).
+    one weight per view, all photos have the same white balance, and a view's three factors are equal. If `view` is a slice, the result
+    has a row for each of its views (V, 3).
     """
     weights = state.learned.get("exposure")
     return None if weights is None else (weights[view] @ state.part(Exposures).basis[: weights.shape[1]]).exp()

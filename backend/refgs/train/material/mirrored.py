@@ -32,7 +32,7 @@ class Fit(NamedTuple):
     """Hold how well each of N surfels is explained, together with its neighbours.
 
     - `ratio` (N,): the squared error as a metal, divided by that as paint
-    - `slope` (N,): how much the radiance changes with what is mirrored, from photo to photo
+    - `slope` (N,): how much the shown radiance grows per unit of mirrored radiance, by a straight line fitted over the photos
     - `reflectance` (N, 3), `roughness` (N,): values of the metal that fits best
     - `seen` (N,): whether photos show the surfel and its neighbours in enough pixels
     """
@@ -63,7 +63,10 @@ def fit_both(state: State) -> tuple[Surfels, Seen, Fit]:
 def _mirrored(
     state: State, surfels: Surfels, seen: Seen, light: Environment, turns: list[Tensor]
 ) -> Iterator[list[Tensor]]:
-    """Yield for each photo what the surfels mirror there, as one tensor (N, 3) for each of ROUGHNESSES."""
+    """Yield, for each photo, the linear radiance that the surfels mirror towards its camera: a tensor (N, 3) for each of ROUGHNESSES.
+
+    `turns` has a rotation matrix (3, 3) for each photo. It turns directions in the run's frame into those in which `light` is sampled.
+    """
     levels, occluder = cubemap.in_texel_order(light.levels, light.sides), state.occluder
     there = torch.zeros(0, 3) if occluder is None else _at_vertices(surfels, seen, occluder.mesh)
     points = surfels.positions.double().numpy()

@@ -66,7 +66,7 @@ class Seen(NamedTuple):
     - `radiance` (N, V, 3): linear, without the photo's exposure
     - `weight` (N, V): the surfel's blending weights, summed over its pixels; 0 where the surfel is clipped, hardly seen or grazing
     - `pixels` (N,): the surfel's blending weights, summed over its pixels in all photos, also where `weight` is 0
-    - `mean` (N, 3): the mean radiance over the same pixels
+    - `mean` (N, 3): the mean radiance over the pixels that are counted in `pixels`
     - `normal` (N, V, 3): the unit normal that is blended at its pixels
     - `towards` (N, V, 3): the unit direction to the camera
     """
@@ -120,7 +120,7 @@ def observe_changes(state: State) -> Observations:
 
 @torch.no_grad()
 def observe_mirrored(state: State, inputs: RenderInputs, views: list[int]) -> Seen:
-    """Measure the radiance of the surfels of `inputs` in some training views, without exposures, and the normals blended there."""
+    """Observe the surfels of `inputs` in the training photos with the indices `views`. The photos' exposures are divided out."""
     sums = [_sums(state, inputs, view) for view in views]
     radiance, pixels, clipped, normal = torch.stack(sums, dim=1).cpu().split([3, 1, 1, 3], dim=2)
     towards = _towards(inputs.surfels, [state.photo(view) for view in views]).cpu()
@@ -181,10 +181,10 @@ def _residuals(
 
 
 def _fitted(factor: Tensor, totals: Tensor, pixels: Tensor, mean: Tensor, light: Tensor | None) -> Tensor:
-    """Fit the factors (N, V) on each surfel's mean radiance in each photo to the residuals: the exposure and the diffuse light.
+    """Correct each surfel's `factor` (N, V) in each photo by the residuals. In the model, a photo shows `factor` times `mean` (N, 3).
 
-    `light` (N, V, 9) are harmonics of the diffuse light. Without it, a factor depends on the photo alone. A photo's exposure is a median,
-    because highlights hardly move a median.
+    `totals` and `pixels` are the residuals and weights from `_residuals`. A factor holds the photo's exposure, corrected by a median, which
+    highlights hardly move. With `light` (N, V, 9), harmonics of the normals, it also holds the diffuse light. The result's mean is 1.
     """
     brightness = mean.mean(dim=1)
     known = (pixels > LEAST_PIXELS) & (brightness > DARK)[:, None]
@@ -207,7 +207,7 @@ def from_grey(colour: Tensor) -> Tensor:
 def averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Average observations over each surfel's neighbours, as listed in `near` (N, K).
 
-    Returns the mean radiance (N, 3), the changes from it in each photo (N, V, 3), and where these are known (N, V).
+    Returns the mean radiance (N, 3), how far each photo's radiance is from it (N, V, 3; 0 where unknown), and whether that is known (N, V).
     """
     weight = observations.pixels * (observations.clipped < LEAST_CLIPPED) * (observations.pixels > LEAST_PIXELS)
     pixels = pooled(weight, near)
