@@ -28,7 +28,7 @@ from refgs.kernels import cuda
 from refgs.kernels.load import cache_folder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
-from refgs.paths import clone_root
+from refgs.paths import clone_environment, clone_root
 from refgs.render.rasterize import rasterize
 from refgs.render.renderer import render
 from refgs.settings import load_settings
@@ -206,7 +206,8 @@ def measure_trainings(bench: Bench, device: torch.device, folder: Path) -> None:
     if not capture.exists():
         words = ("--size", side, "--train", views, "--test", 20, "--samples", 64)
         command = [sys.executable, "-m", "benchmarks.scenes", name, "--out", capture, *words]
-        subprocess.run([str(word) for word in command], check=True, cwd=clone_root(), stdout=subprocess.DEVNULL)
+        how = {"cwd": clone_root(), "env": clone_environment(), "stdout": subprocess.DEVNULL}
+        subprocess.run([str(word) for word in command], check=True, **how)
     for preset in ("standard", "paper"):
         run = folder / f"{name}-{preset}-{time.strftime('%H%M%S')}"
         if not train(capture, run, ("--preset", preset, "--device", device.type)):

@@ -21,7 +21,7 @@ from refgs.compare import metrics
 from refgs.compare.pictures import as_bytes, maps, over_white, write_png
 from refgs.compare.truth import FOLDER, GroundTruth, read_relit
 from refgs.formats.exr import write_exr
-from refgs.paths import clone_root
+from refgs.paths import clone_environment, clone_root
 from refgs.run import Run, open_run
 
 RENDERER, OTHER = "renderer", "other"
@@ -118,7 +118,8 @@ def draw_in_blender(run: Path, panoramas: dict[str, np.ndarray], views: list[str
         write_exr(file, panoramas[file.stem])
     command = [sys.executable, "-m", "benchmarks.look_in_blender", run, "--out", out]
     command += ["--views", *views, "--hdri", *files]
-    done = subprocess.run(list(map(str, command)), cwd=clone_root(), capture_output=True, text=True)
+    how = {"cwd": clone_root(), "env": clone_environment(), "capture_output": True, "text": True}
+    done = subprocess.run(list(map(str, command)), **how)
     if done.returncode:
         raise RuntimeError(f"Blender did not draw {run}:\n{done.stderr[-2000:]}")
     return json.loads(done.stdout.splitlines()[-1])

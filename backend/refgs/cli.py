@@ -287,6 +287,7 @@ def main() -> None:
     output = open_streams()
     warnings.showwarning = _one_line(warnings.showwarning)
     signal.signal(signal.SIGTERM, _terminate)
+    os.environ["PYTHONSAFEPATH"] = "1"  # for children: multiprocessing's would import what lies in the current folder
     if "REFGS_END_WITH_INPUT" in os.environ:
         threading.Thread(target=_end_with_input, daemon=True).start()
     try:

@@ -14,7 +14,7 @@ from refgs.asked import Asked
 from refgs.compare import metrics
 from refgs.compare.truth import read_relit
 from refgs.errors import InputError
-from refgs.paths import clone_root
+from refgs.paths import clone_environment, clone_root
 from refgs.report.page import write_report
 from refgs.run_folder import update_metrics
 
@@ -72,7 +72,9 @@ def run(out: Path) -> None:
 def _check_blender(root: Path) -> None:
     """Raise InputError if Blender's Python module cannot be loaded."""
     check = "from refgs_addon.preview import check_libraries; check_libraries()"
-    done = subprocess.run([sys.executable, "-c", check], cwd=root, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", check], cwd=root, env=clone_environment(), capture_output=True, text=True
+    )
     if done.returncode:
         raise InputError(done.stderr.strip().splitlines()[-1].partition(": ")[2])
 
@@ -86,7 +88,9 @@ def _child(root: Path, what: str, module: str, *arguments: object) -> None:
     command = [sys.executable, "-m", module, *map(str, arguments)]
     with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
         with (
-            subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
+            subprocess.Popen(
+                command, cwd=root, env=clone_environment(), stdout=subprocess.PIPE, stderr=errors, text=True
+            ) as process,
             commands.progress_bar(what, 1) as bar,
         ):
             for line in process.stdout or ():

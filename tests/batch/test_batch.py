@@ -5,9 +5,12 @@ import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
 import tempfile
 import time
 import tomllib
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -125,21 +128,28 @@ def test_bad_words_give_one_line_and_leave_nothing(shelf, words, says):
 
 
 def test_folders_of_killed_batches_are_removed():
-    """Make folders as batches do: of one that was killed, one that works, and one that is about to lock its folder."""
-    folders = [Path(tempfile.mkdtemp(prefix="refgs-", dir="/tmp")) for _ in range(3)]
-    for folder, age in zip(folders, (100, 100, 0), strict=True):
-        (folder / engine.LOCKED).touch()
-        os.utime(folder / engine.LOCKED, (time.time() - age, time.time() - age))
+    """Make folders as batches do.
+
+    They are of one that was killed, one that works, one that is about to lock its folder, one that ended badly without a lock in it, and
+    one of somebody else's files.
+    """
+    folders = [Path(tempfile.mkdtemp(prefix=engine.FOLDERS, dir="/tmp")) for _ in range(5)]
+    for folder, age in zip(folders, (100, 100, 0, 100, 100), strict=True):
+        (folder / {3: engine.RAY, 4: "photo.jpg"}.get(folders.index(folder), engine.LOCKED)).touch()
+        os.utime(folder, (time.time() - age, time.time() - age))
     try:
         with FileLock(folders[1] / engine.LOCKED):
             made = engine._make_folder()
-        assert [folder.exists() for folder in (*folders, made)] == [False, True, True, True]
+        assert [folder.exists() for folder in (*folders, made)] == [False, True, True, False, True, True]
+        assert made.stat().st_mode & 0o777 == 0o700
     finally:
         for folder in folders:
             shutil.rmtree(folder, ignore_errors=True)
 
 
 def test_another_ray_is_refused(monkeypatch):
+    for name in (*engine.ENVIRONMENT, *engine.ALONE, "RAY_AUTH_TOKEN"):  # restored for the processes of other tests
+        monkeypatch.setenv(name, "")
     pinned = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]["farm"]
     assert pinned == [f"ray=={engine.VERSION}"]
     monkeypatch.setattr(engine, "VERSION", "1.0.0")
@@ -148,3 +158,67 @@ def test_another_ray_is_refused(monkeypatch):
         engine.started(None, 1, 1),
     ):
         pass
+
+
+LISTENS = "0A"  # the state of a socket in /proc/net/tcp (Linux's include/net/tcp_states.h: TCP_LISTEN)
+
+
+def listening(session: int) -> set[str]:
+    """Return the addresses, in hexadecimal, on which the processes of a session listen, and Ray's that have left it."""
+    rows = [line.split() for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()[1:]]
+    known = {f"socket:[{row[9]}]": row[1].partition(":")[0] for row in rows if row[3] == LISTENS}
+    found = set()
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            words = (process / "cmdline").read_bytes()
+            own = int((process / "stat").read_text().rpartition(")")[2].split()[3]) == session
+            if own or b"refgs-ray-" in words or words.startswith(b"ray::"):
+                found |= {known[link] for file in (process / "fd").iterdir() if (link := os.readlink(file)) in known}
+    return found
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
+def test_a_batch_is_closed_to_other_users_and_to_modules_beside_the_captures(shelf, tmp_path):
+    """Check whom Ray listens to, who can open its folder, and that no module of the current folder is imported."""
+    for name in ("typer", "filelock", "multiprocessing", "pydantic", "json", "ray"):
+        (shelf / f"{name}.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'a').write({name!r})")
+    before = set(Path("/tmp").glob(f"{engine.FOLDERS}*"))
+    out = shelf / "runs"
+    process = batch(shelf / "list.toml", out, cwd=shelf)
+    until(process, (out / "ball" / "progress.json").exists)
+    addresses = listening(process.pid)
+    (folder,) = set(Path("/tmp").glob(f"{engine.FOLDERS}*")) - before
+    modes = [path.stat().st_mode & 0o777 for path in (folder, folder / engine.RAY)]
+    process.send_signal(signal.SIGTERM)
+    status, said = ended(process, grace=120)
+    assert status == 75, said
+    assert addresses and addresses <= {
+        "0100007F",
+        "0000000000000000FFFF00000100007F",
+        f"{0:024X}01000000",
+    }  # 127.0.0.1 and ::1
+    assert modes[0] == 0o700 and not folder.exists()
+    assert not (tmp_path / "imported").exists()
+
+
+def test_a_batch_whose_ray_does_not_start_leaves_no_folder(shelf, tmp_path):
+    before = set(Path("/tmp").glob(f"{engine.FOLDERS}*"))
+    code = f"""
+import sys
+from refgs.batch import engine
+from refgs import cli
+import ray
+def fail(*_, **how):
+    from pathlib import Path
+    Path(how["_temp_dir"], "session").mkdir(parents=True, exist_ok=True)
+    raise RuntimeError("its parts wait for each other")
+ray.init = fail
+sys.argv = ["refgs", "batch", {str(shelf / "list.toml")!r}, "--out", {str(shelf / "runs")!r}, "--device", "cpu"]
+cli.main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE)
+    assert done.returncode == 75, done.stderr
+    assert done.stderr.strip() == (
+        "refgs: Ray does not start here (its parts wait for each other): wait until the machine is less busy"
+    )
+    assert set(Path("/tmp").glob(f"{engine.FOLDERS}*")) <= before

@@ -4,6 +4,8 @@ import json
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -75,6 +77,37 @@ def test_a_full_disk_is_tried_again(tmp_path, small_disk):
         run_step(there, 1, 0.0, None, ())
     (small_disk / "filler").unlink()
     assert run_step(there, 1, 0.0, None, ()).status == 0
+
+
+def test_a_log_that_is_moved_away_is_tried_again(tmp_path, monkeypatch):
+    done = step(tmp_path, "poses", nerfstudio(tmp_path / "cup", 8), "--once")
+
+    def call(step, cores, log):
+        step.log.parent.rename(tmp_path / "elsewhere")
+        return 0, ""
+
+    with monkeypatch.context() as patched, pytest.raises(TryLater, match=r"cannot be read or written \(No such file"):
+        patched.setattr("refgs.batch.steps._call", call)
+        run_step(done, 1, 0.0, None, ())
+    assert run_step(done, 1, 0.0, None, ()).status == 0
+
+
+def test_modules_beside_the_captures_are_not_imported(tmp_path, monkeypatch):
+    """Check a step, and the children that it would start, in a folder with modules of the trainer's names."""
+    for name in ("typer", "multiprocessing", "numpy"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'a').write({name!r})")
+    capture = nerfstudio(tmp_path / "cup", 8)
+    monkeypatch.chdir(tmp_path)
+    assert run_step(step(tmp_path, "poses", capture, "--once"), 1, 0.0, None, ()).status == 0
+    code = "import multiprocessing, os\nif __name__ == '__main__':\n"
+    code += " from refgs import cli\n import sys\n sys.argv = ['refgs', '--version']\n"
+    code += " try: cli.main()\n except SystemExit: pass\n"
+    code += " multiprocessing.get_context('spawn').Process(target=os.getpid).start()\n"
+    (tmp_path / "programs").mkdir()
+    (tmp_path / "programs" / "start.py").write_text(code)  # as bin/refgs, which does not lie beside the captures
+    done = subprocess.run([sys.executable, "programs/start.py"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "imported").exists()
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")

@@ -11,15 +11,20 @@ from tests.makers import processes
 PATIENCE = 240.0  # seconds
 
 
-def batch(source, out, *words) -> subprocess.Popen:
+def batch(source, out, *words, cwd=None) -> subprocess.Popen:
     """Start `refgs batch` in a session of its own, on the CPU. Its output is in its pipe `stdout`.
 
     It ignores SIGINT at first, as in the background of a shell script.
     """
-    command = [sys.executable, "-m", "refgs.cli", "batch", source, "--out", out, "--device", "cpu", *words]
+    command = [sys.executable, "-Pm", "refgs.cli", "batch", source, "--out", out, "--device", "cpu", *words]
     with ignored(signal.SIGINT):
         return subprocess.Popen(
-            list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+            list(map(str, command)),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+            cwd=cwd,
         )
 
 

@@ -124,6 +124,7 @@ class Batch:
     def _write_rows(self) -> None:
         """Write rows.json, in which other programs read the state of each run."""
         self._wrote = time.monotonic()
+        (self._out / LOGS).mkdir(exist_ok=True)  # somebody may have moved it away
         write_rows(self._out / LOGS / ROWS, [self._row(run) for run in self._runs.values()])
 
     def _submit(self, job: Job, engine: Engine, card: int | None) -> None:

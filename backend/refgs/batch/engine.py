@@ -30,7 +30,8 @@ PAUSE = 5.0  # seconds before such a step is tried again
 STARTS = 4  # attempts to start Ray here: on a busy machine its parts wait for each other no longer than 15 seconds
 PATIENCE = 60.0  # seconds for a cluster to answer
 SILENCE = 20.0  # seconds without an answer after which the head is taken to be dead: after 60, Ray ends the process
-LOCKED, NEW = "refgs.lock", 60.0  # a file in Ray's folder, and the seconds that a batch has to lock it
+FOLDERS, RAY = "refgs-ray-", "r"  # the first letters of a batch's folder, and Ray's in it: sockets need short names
+LOCKED, NEW = "refgs.lock", 60.0  # a file in a batch's folder, and the seconds that a batch has to lock it
 JOIN = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False, logging_level='CRITICAL')"
 STORE = 80 << 20  # bytes of Ray's object store: steps hand on files, not objects
 MARK, READERS = "shared-", 8  # the first letters of a file that shows who shares the runs; machines that copy at once
@@ -40,6 +41,11 @@ ENVIRONMENT = {
     "RAY_worker_niceness": "0",  # commands run as fast as without Ray
     "RAY_task_oom_retries": "3",  # for ever otherwise
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "PYTHONSAFEPATH": "1",  # import nothing that lies beside the captures
+}
+ALONE = {  # for a Ray of this machine alone, which nobody else may use
+    "RAY_AUTH_MODE": "token",
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # it listens on 127.0.0.1, on Linux, too
 }
 
 
@@ -128,6 +134,8 @@ class Engine:
         except exceptions.RayTaskError as error:
             if isinstance(error.cause, TryLater):
                 return Outcome(TRY_AGAIN, what=f"{error.cause} (tried {TRIES + 1} times)")
+            if isinstance(error.cause, OSError):
+                return Outcome(TRY_AGAIN, what=f"a file could not be read or written ({error.cause}): mend that")
             why = str(error.cause).strip().splitlines()[:1]  # the rest is a traceback
             return Outcome(1, what=f"Ray could not run it ({''.join(why)}): see that all machines have the same refgs")
         except exceptions.RayError as error:  # its worker or machine died
@@ -199,7 +207,7 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
                 _join(ray, address)
             else:
                 lent = workers * cores if workers else max(os.cpu_count() or 1, cores)
-                _start(ray, quiet | {"num_cpus": lent, "object_store_memory": STORE, "_temp_dir": str(folder)})
+                _start(ray, quiet | {"num_cpus": lent, "object_store_memory": STORE, "_temp_dir": str(folder / RAY)})
         yield Engine(ray, cores)
     finally:
         with _signals(signal.SIG_IGN):  # stopped half way, Ray waits for a minute and ends this process with 1
@@ -245,19 +253,38 @@ def _signals(handler: Any) -> Iterator[None]:
 
 
 def _make_folder() -> Path:
-    """Make a folder for Ray's sockets and logs, which is removed at exit. Remove the folders that killed batches have left."""
+    """Make a folder for Ray's sockets and logs, which is removed at exit. Remove the folders that killed batches have left.
+
+    No other user can open it. Ray lets all users write in its own folder, which is therefore in this one.
+    """
     parent = Path("/tmp" if os.name == "posix" else tempfile.gettempdir())  # names of sockets must be short
-    for file in parent.glob(f"refgs-*/{LOCKED}"):
+    for old in parent.glob(f"{FOLDERS}*"):
         with suppress(OSError, Timeout):
-            if time.time() > file.stat().st_mtime + NEW:
-                with FileLock(file, timeout=0):  # its batch has ended
-                    shutil.rmtree(file.parent, ignore_errors=True)
-    folder = Path(tempfile.mkdtemp(prefix="refgs-", dir=parent))
+            if _is_left(old):
+                with FileLock(old / LOCKED, timeout=0):  # its batch has ended
+                    shutil.rmtree(old, ignore_errors=True)
+    folder = Path(tempfile.mkdtemp(prefix=FOLDERS, dir=parent))
     lock = FileLock(folder / LOCKED)
     lock.acquire()
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    atexit.register(lock.release)  # which runs before the line above, and keeps the lock until then
+    atexit.register(_remove, folder, lock)
     return folder
+
+
+def _remove(folder: Path, lock: FileLock) -> None:
+    """Remove a batch's folder. Ray's processes, which may still be ending, write in it: try for some seconds."""
+    until = time.monotonic() + TIDY
+    while (folder / RAY).exists() and time.monotonic() < until:
+        shutil.rmtree(folder / RAY, ignore_errors=True)
+        time.sleep(0.1)
+    lock.release()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_left(folder: Path) -> bool:
+    """Tell whether a folder was made by `_make_folder` long ago, for this user. Batches that ended badly may have left no lock in it."""
+    facts = folder.stat()
+    own = not hasattr(os, "getuid") or facts.st_uid == os.getuid()
+    return own and time.time() > facts.st_mtime + NEW and {file.name for file in folder.iterdir()} <= {LOCKED, RAY}
 
 
 def _import_ray(cluster: bool) -> Any:
@@ -267,8 +294,8 @@ def _import_ray(cluster: bool) -> Any:
     missing or has another version than VERSION.
     """
     os.environ.update({name: value for name, value in ENVIRONMENT.items() if name not in os.environ})
-    if not cluster:  # nobody else may use this Ray, and no token need be kept for it
-        os.environ.update({"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)})
+    if not cluster:  # no token need be kept for it
+        os.environ.update(ALONE | {"RAY_AUTH_TOKEN": secrets.token_hex(32)})
     try:
         found = importlib.metadata.version("ray")
     except importlib.metadata.PackageNotFoundError:
@@ -283,10 +310,25 @@ def _import_ray(cluster: bool) -> Any:
     return ray
 
 
+class _NoPaths(list):
+    """List of folders in which workers look for modules. It stays empty: Ray adds the current folder, where captures may be."""
+
+    def extend(self, _: Any) -> None:
+        pass
+
+
+def _without_paths() -> Any:
+    from ray.job_config import JobConfig
+
+    config = JobConfig()
+    config._py_driver_sys_path = _NoPaths()
+    return config
+
+
 def _start(ray: Any, how: dict[str, Any]) -> None:
     for attempt in range(STARTS):
         try:
-            ray.init(address="local", **how)
+            ray.init(address="local", job_config=_without_paths(), **how)
             return
         except Exception as error:  # Ray raises whatever its parts meet
             ray.shutdown()
@@ -303,7 +345,9 @@ def _join(ray: Any, address: str) -> None:
     try:
         socket.create_connection((host, int(port)), timeout=5).close()
         # First in another process: with what is not Ray, this takes minutes, in which it cannot be interrupted.
-        tried = subprocess.run([sys.executable, "-c", JOIN, address], capture_output=True, text=True, timeout=PATIENCE)
+        tried = subprocess.run(
+            [sys.executable, "-P", "-c", JOIN, address], capture_output=True, text=True, timeout=PATIENCE
+        )
     except subprocess.TimeoutExpired:
         raise InputError(f"{nobody} that answers: start one with ray start --head") from None
     except (OSError, OverflowError) as error:
@@ -316,4 +360,4 @@ def _join(ray: Any, address: str) -> None:
         raise InputError(
             f"--address {address}: this machine cannot join ({why}): run this on one of the cluster's, with its token"
         )
-    ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)
+    ray.init(address=address, job_config=_without_paths(), log_to_driver=False, logging_level=logging.CRITICAL)

@@ -92,6 +92,9 @@ def run_step(step: Step, cores: int, pause: float, depot: Any, optional: tuple[b
     except TryAgain as error:
         time.sleep(pause)
         raise TryLater(str(error)) from None
+    except OSError as error:  # a folder that somebody has moved away, say
+        time.sleep(pause)
+        raise TryLater(f"{error.filename or step.log.parent} cannot be read or written ({error.strerror})") from None
     except InputError as error:
         return Outcome(2, node=platform.node(), what=str(error))
     if outcome.status and outcome.status not in FAILED:
@@ -127,7 +130,8 @@ def _call(step: Step, cores: int, log) -> tuple[int, str]:
     log.flush()
     start = log.tell()
     environment = os.environ | {"REFGS_END_WITH_INPUT": "1", "OMP_NUM_THREADS": str(cores), "PYTHONUNBUFFERED": "1"}
-    command = [sys.executable, "-m", "refgs.cli", *step.words]
+    environment["PYTHONSAFEPATH"] = "1"  # import nothing that lies beside the captures, nor let the step's own children
+    command = [sys.executable, "-P", "-m", "refgs.cli", *step.words]
     # In a group of its own: Ray kills the whole group of a worker that dies, and a training could write no checkpoint.
     group = 0 if os.name == "posix" else None
     process = subprocess.Popen(

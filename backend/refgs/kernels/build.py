@@ -138,14 +138,14 @@ def _compile(target: Target, library: Path) -> None:
     """Compile the kernels in a temporary folder beside the file `library`, then move the result to `library`."""
     with tempfile.TemporaryDirectory(prefix="build-", dir=library.parent, ignore_cleanup_errors=True) as scratch:
         made = Path(scratch) / library.name
-        command = [sys.executable, "-m", "ziglang", "c++", *FLAGS]
+        command = [sys.executable, "-P", "-m", "ziglang", "c++", *FLAGS]
         command += ["-target", target.platform, f"-mcpu={target.processor}"]
         if target.extension != "dll":
             command.append("-fPIC")
         # Zig's own cache is deleted with the scratch folder: it takes tens of megabytes and saves nothing the next time.
         environment = os.environ | {"ZIG_LOCAL_CACHE_DIR": scratch, "ZIG_GLOBAL_CACHE_DIR": scratch}
         with subprocess.Popen(
-            [sys.executable, WITH_PARENT, *command, *SOURCES, "-o", str(made)],
+            [sys.executable, "-P", WITH_PARENT, *command, *SOURCES, "-o", str(made)],
             cwd=HERE,
             env=environment,
             stdin=subprocess.PIPE,  # closed when this process ends
