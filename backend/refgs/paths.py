@@ -13,8 +13,8 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 from refgs.errors import InputError, TryAgain
 
@@ -126,7 +126,7 @@ def read_text(file: Path, again: str) -> str:
         raise InputError(f"{file}: cannot be read ({error.strerror}). {again}") from None
 
 
-def open_file(file: str | os.PathLike) -> BinaryIO:
+def open_file(file: str | os.PathLike) -> BufferedReader:
     """Open an ordinary file to read its bytes.
 
     Raises OSError if it cannot be read, or if it is a folder, a pipe, a socket or a device, which may have no end.
@@ -164,7 +164,7 @@ def hash_file(file: Path, kind: Callable = hashlib.blake2b) -> "hashlib._Hash":
     Raises OSError if the file cannot be read, or if it is a folder, a pipe or a device.
     """
     with open_file(file) as opened:
-        return hashlib.file_digest(opened, kind)  # pyright: ignore[reportArgumentType]  # its stub lacks BinaryIO
+        return hashlib.file_digest(opened, kind)
 
 
 def read_bytes(file: Path) -> bytes:

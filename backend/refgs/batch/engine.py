@@ -207,7 +207,7 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
                 _join(ray, address)
             else:
                 lent = workers * cores if workers else max(os.cpu_count() or 1, cores)
-                _start(ray, quiet | {"num_cpus": lent, "object_store_memory": STORE, "_temp_dir": str(folder / RAY)})
+                _start(ray, quiet | {"num_cpus": lent, "object_store_memory": STORE, "_temp_dir": f"{folder}/{RAY}"})
         yield Engine(ray, cores)
     finally:
         with _signals(signal.SIG_IGN):  # stopped half way, Ray waits for a minute and ends this process with 1

@@ -111,7 +111,7 @@ def _as_rec709(path: Path, pixels: np.ndarray, primaries: np.ndarray) -> np.ndar
     if primaries.shape == np.shape(REC709) and np.allclose(primaries, REC709, atol=1e-3):
         return pixels
     try:
-        matrix = primaries_to_rec709(primaries).astype(np.float32)
+        matrix = primaries_to_rec709(primaries.tolist()).astype(np.float32)
     except ValueError:
         raise InputError(f"{path}: its chromaticities span no colours. Save it as linear Rec.709.") from None
     for row in pixels:
