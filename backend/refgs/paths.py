@@ -18,9 +18,8 @@ from pathlib import Path
 
 from refgs.errors import InputError, TryAgain
 
-LARGEST = (
-    64 << 20
-)  # bytes of a text file, or of another that is read as a whole; Python takes up to 20 times as much memory for what it holds
+# Bytes of a text file, or of another that is read as a whole. Python takes up to 20 times as much memory for what it holds.
+LARGEST = 64 << 20
 PACKAGE = Path(__file__).resolve().parent
 ROOT = PACKAGE.parents[1]
 PRESETS = PACKAGE / "presets" if (PACKAGE / "presets").is_dir() else ROOT / "presets"  # in a wheel, in a clone
@@ -34,7 +33,8 @@ DISK_ERRORS = tuple(
     if hasattr(errno, name)
 )
 # A file system has no locks. Any other error means that a lock may be held: by another user, say.
-NO_LOCKS = {getattr(errno, name, None) for name in ("ENOLCK", "ENOSYS", "ENOTSUP", "EOPNOTSUPP")}
+_NO_LOCKS = "ENOLCK", "ENOSYS", "ENOTSUP", "EOPNOTSUPP"
+NO_LOCKS = tuple(getattr(errno, name) for name in _NO_LOCKS if hasattr(errno, name))
 PAUSES = (0.05, 0.15, 0.3, 0.5)  # seconds between attempts to rename a file
 _TEMPORARY = re.compile(r"\.refgs-[0-9a-f]{16}\.tmp")
 

@@ -34,13 +34,14 @@ from refgs.formats.colmap import (
 class Model(NamedTuple):
     """Hold where a COLMAP capture's files are: its sparse model `folder` and the folder of its `photos`.
 
-    `root` is the folder that holds the folder `masks`. `others` are the folders of the capture's other models, which are not used.
+    `root` is the folder that holds the folder `masks`. `others` are the folders of the capture's other models, which are not used,
+    with the number of photos of each.
     """
 
     folder: Path
     photos: Path
     root: Path
-    others: list[Path]
+    others: list[tuple[Path, int]]
 
 
 def find_model(folder: Path) -> Model | None:
@@ -55,15 +56,17 @@ def find_model(folder: Path) -> Model | None:
     found = [path for pattern in _MODELS for path in _sorted(top, pattern) if _is_model(path, pattern)]
     if not found:
         return None
-    found.sort(key=_registered if len(found) > 1 else lambda _: 0, reverse=True)
-    model = found[0]
+    counts = {path: _registered(path) if len(found) > 1 else 0 for path in found}
+    found.sort(key=counts.__getitem__, reverse=True)
+    model, *others = found
+    rest = [(other, counts[other]) for other in others]
     if reduced:
-        return Model(model, folder, top, found[1:])
+        return Model(model, folder, top, rest)
     # COLMAP's image_undistorter writes photos of its own beside the model.
     for above in (model.parent, model.parent.parent):
         if above != top and above.is_relative_to(top) and (above / "images").is_dir():
-            return Model(model, above / "images", top, found[1:])
-    return Model(model, photo_folder(Files(top)), top, found[1:])
+            return Model(model, above / "images", top, rest)
+    return Model(model, photo_folder(Files(top)), top, rest)
 
 
 # Where COLMAP and the programs that call it put models.
@@ -77,9 +80,8 @@ def _sorted(top: Path, pattern: str) -> list[Path]:
     """Return the folders that match a pattern, `sparse/2` before `sparse/10`."""
     if pattern == ".":
         return [top]
-    if (
-        pattern.startswith("colmap") and (top / "colmap" / "images").is_dir()
-    ):  # a capture of its own, in a folder of captures
+    # A folder `colmap` with photos is a capture of its own, in a folder of captures.
+    if pattern.startswith("colmap") and (top / "colmap" / "images").is_dir():
         return []
     found = (path for path in top.glob(pattern) if not path.name.startswith("."))
     return sorted(found, key=lambda path: (len(path.name), path.name))
@@ -133,9 +135,10 @@ def _passed_over(model: Model, count: int) -> list[str]:
     """Say in one line which models are not used. Return [] if there is only one. `count` is the number of photos of the model in use."""
     if not model.others:
         return []
-    ours, first = (path.relative_to(model.root).as_posix() for path in (model.folder, model.others[0]))
+    other, photos = model.others[0]
+    ours, first = (path.relative_to(model.root).as_posix() for path in (model.folder, other))
     what = f"{len(model.others) + 1} COLMAP models: {ours} is used, as no other has more than its {count} photos"
-    return [f"{what}; {len(model.others)} not used, first {first} ({_registered(model.others[0])} photos)"]
+    return [f"{what}; {len(model.others)} not used, first {first} ({photos} photos)"]
 
 
 def _find(photos: Files, name: str) -> Path | None:

@@ -20,6 +20,8 @@ from PIL import ExifTags, Image, ImageCms
 from refgs.capture.reduce import encode
 from refgs.color import REC709, pcs_to_rec709, primaries_to_rec709, srgb_decode, srgb_encode
 from refgs.errors import InputWarning, reason
+from refgs.formats.pixels import png_chunks
+from refgs.paths import open_file
 
 Found = TypeVar("Found", bound="Profile | LookUp | None")
 Curve = Callable[[np.ndarray], np.ndarray]  # from codes 0..1 to linear values
@@ -117,9 +119,8 @@ class Profile:
             linear = cv2.LUT(part, table[None]) if largest == 255 else table[part, (0, 1, 2)]
             if white == 255:  # by a table, because a power takes ten times as long
                 linear = cv2.transform(linear, matrix * 65535)
-                steps = np.asarray(
-                    cv2.addWeighted(linear, 1, linear, 0, 0, dtype=cv2.CV_16U), np.uint16
-                )  # rounds, clips
+                # It rounds and clips.
+                steps = np.asarray(cv2.addWeighted(linear, 1, linear, 0, 0, dtype=cv2.CV_16U), np.uint16)
                 np.take(_bytes(), steps, out=out[top : top + step], mode="clip")
             else:
                 out[top : top + step] = encode(cv2.transform(linear, matrix), white)
@@ -220,13 +221,13 @@ def _is_adobe_rgb(picture: Image.Image) -> bool:
 
 def _png_code_points(path: Path) -> tuple[int, int] | None:
     """Return the primaries and the transfer of a PNG's chunk cICP (PNG specification, 11.3.2.6). Pillow does not read it."""
-    with path.open("rb") as file:
-        file.seek(8)
-        while len(head := file.read(8)) == 8 and head[4:] != b"IDAT":
-            if head[4:] == b"cICP":
+    with open_file(path) as file:
+        for name, _ in png_chunks(file):
+            if name == b"cICP":
                 points = file.read(2)
                 return (points[0], points[1]) if len(points) == 2 else None
-            file.seek(int.from_bytes(head[:4], "big") + 4, 1)
+            if name == b"IDAT":
+                break
     return None
 
 

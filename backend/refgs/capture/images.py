@@ -265,12 +265,8 @@ def _stored_numbers(path: Path) -> np.ndarray | None:
     with _open(path) as picture:
         if picture.mode not in ("1", "L", "P", "I", "F") or picture.has_transparency_data:
             return None
-        try:
+        with _decoding(path):
             values = np.rot90(np.asarray(picture), -_turns(picture))
-        except Exception as error:
-            if is_shortage(error):
-                raise
-            raise InputError(f"{path}: the image is truncated or broken ({reason(error)}). Replace it.") from error
         if picture.mode in ("1", "L"):
             return values
         if picture.mode != "P":

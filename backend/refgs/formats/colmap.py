@@ -18,8 +18,6 @@ import numpy as np
 from refgs.errors import InputError
 from refgs.paths import LARGEST, open_file
 
-LONGEST_NAME = 65_536  # bytes of a photo's name, with its folders
-
 T = TypeVar("T")
 
 UNDISTORT = "Undistort the photos with COLMAP's image_undistorter and use its output."
@@ -48,7 +46,6 @@ MODELS = {
 PARAMETERS = {name: tuple(parameters.split()) for name, parameters in MODELS.values()}
 FARTHEST = 1e12  # largest coordinate: beyond it, float64 does not resolve an object of 1 unit well
 LONGEST_NAME = 4096  # bytes of a photo's path
-LARGEST_TEXT = 2 << 30  # bytes of a text file; a model of 1,000 photos has 200 MB
 
 
 @dataclass(frozen=True)

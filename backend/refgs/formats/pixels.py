@@ -1,7 +1,9 @@
 """Refuse pictures by the size that they declare, before memory is taken for their pixels. Decode some by OpenCV."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from PIL import Image
@@ -9,8 +11,9 @@ from PIL import Image
 from refgs.errors import InputError
 from refgs.paths import LARGEST, check_file, open_file
 
+PNG = b"\x89PNG\r\n\x1a\n"  # its first bytes
 # First bytes of what OpenCV is given: PNG, TIFF of either endianness, Radiance. By these it chooses the decoder, whatever a file's name.
-_DECODED = (b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"#?RADIANCE", b"#?RGBE")
+_DECODED = (PNG, b"II*\0", b"MM\0*", b"#?RADIANCE", b"#?RGBE")
 
 MOST = 256_000_000  # pixels; cameras take up to 200 million, or 240 by shifting the sensor
 # A larger picture in a file so small that this many pixels share a byte is taken for a broken one. A PNG of one colour has 1032 to 8256, by
@@ -49,20 +52,26 @@ def check_length(path: Path) -> None:
 
 
 def check_chunks(path: Path) -> None:
-    """Raise InputError if a PNG declares more bytes than it has: OpenCV would allocate as many as declared. Other formats are not checked.
+    """Raise InputError if a PNG declares more bytes than it has: OpenCV would allocate as many. Other formats are not checked."""
+    size = path.stat().st_size
+    with open_file(path) as file:
+        for _, length in png_chunks(file):
+            if file.tell() + length > size:
+                raise InputError(f"{path}: the image is truncated or broken. Replace it.")
+
+
+def png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
+    """Yield the name and the declared length of each chunk of a PNG, with `file` at the chunk's data. Yield none for other files.
 
     A PNG is 8 bytes and then chunks: a length, a name, that many bytes of data, and a checksum (PNG specification, 5.3).
     """
-    size = path.stat().st_size
-    with open_file(path) as file:
-        if file.read(8) != b"\x89PNG\r\n\x1a\n":
-            return
-        name = b""
-        while name != b"IEND" and len(head := file.read(8)) == 8:
-            length, name = int.from_bytes(head[:4], "big"), head[4:]
-            if file.tell() + length > size:
-                raise InputError(f"{path}: the image is truncated or broken. Replace it.")
-            file.seek(length + 4, 1)
+    if file.read(8) != PNG:
+        return
+    name = b""
+    while name != b"IEND" and len(head := file.read(8)) == 8:
+        length, name, start = int.from_bytes(head[:4], "big"), head[4:], file.tell()
+        yield name, length
+        file.seek(start + length + 4)
 
 
 def check_scans(path: Path, width: int, height: int) -> None:
