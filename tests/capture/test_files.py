@@ -234,5 +234,5 @@ def test_points_of_another_machine(tmp_path):
         "ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
     )
     (folder / "Sparse_PC.ply").write_text(header + rows + "\n")
-    edit(folder / "transforms.json", lambda data: data.update(ply_file_path="/root/else/sparse_pc.ply"))
+    edit(folder / "transforms.json", lambda data: data.update(ply_file_path="/else/where/sparse_pc.ply"))
     assert read_capture(folder).points.shape == (9, 3)

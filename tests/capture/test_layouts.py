@@ -18,6 +18,7 @@ from tests.makers.captures import (
     ball_normals,
     colmap,
     edit,
+    move_photos,
     nerf_blender,
     nerfstudio,
     nero,
@@ -186,15 +187,7 @@ def test_opaque_alpha_is_no_mask(tmp_path):
 
 def test_same_name_in_two_folders(tmp_path):
     folder = nerfstudio(tmp_path)
-
-    def move(data):
-        for i, frame in enumerate(data["frames"]):
-            path = f"images/{'left' if i % 2 else 'right'}/{i // 2:04d}.png"
-            (folder / path).parent.mkdir(exist_ok=True)
-            (folder / frame["file_path"]).rename(folder / path)
-            frame["file_path"] = path
-
-    edit(folder / "transforms.json", move)
+    move_photos(folder, lambda i: f"images/{'left' if i % 2 else 'right'}/{i // 2:04d}.png")
     names = [view.camera.name for view in read_capture(folder).train_views]
     assert len(set(names)) == len(names) == 14
     assert "left_0003" in names

@@ -27,6 +27,7 @@ from tests.makers.captures import (
     colmap,
     edit,
     look_at,
+    move_photos,
     nerfstudio,
     nero,
     ring,
@@ -231,15 +232,7 @@ def test_photos_with_opaque_alpha_get_masks(tmp_path):
 
 def test_photos_of_one_name_in_two_folders_get_masks_of_their_own(tmp_path):
     folder = nerfstudio(tmp_path)
-
-    def move(data):
-        for i, frame in enumerate(data["frames"]):
-            path = f"cam{1 + i % 2}/{i // 2:04d}.png"
-            (folder / path).parent.mkdir(exist_ok=True)
-            (folder / frame["file_path"]).rename(folder / path)
-            frame["file_path"] = path
-
-    edit(folder / "transforms.json", move)
+    move_photos(folder, lambda i: f"cam{1 + i % 2}/{i // 2:04d}.png")
     views = read_capture(folder).views
     targets = making._targets(folder, views)
     assert [targets[view] for view in views] == [folder / "masks" / v.image_path.relative_to(folder) for v in views]

@@ -3,6 +3,7 @@
 import json
 import pickle
 import struct
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 
@@ -129,6 +130,18 @@ def nerfstudio(folder: Path, count: int = 16, poses: list[np.ndarray] | None = N
     data = {"fl_x": 60.0, "fl_y": 60.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(data))
     return folder
+
+
+def move_photos(folder: Path, place: Callable[[int], str]) -> None:
+    """Move the photos of a data set of `nerfstudio`: the one with index i to the path `place(i)` in the folder."""
+
+    def move(data: dict) -> None:
+        for i, frame in enumerate(data["frames"]):
+            (folder / place(i)).parent.mkdir(exist_ok=True)
+            (folder / frame["file_path"]).rename(folder / place(i))
+            frame["file_path"] = place(i)
+
+    edit(folder / "transforms.json", move)
 
 
 def colmap(

@@ -10,7 +10,6 @@ import json
 import os
 import resource
 import signal
-import socket
 import sys
 import time
 import warnings
@@ -18,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tests.makers import fuzz
+from tests.makers.mutants import put_link
 from tests.makers.readers import READERS
 
 HOLE = 30 << 30  # bytes of a file with a hole: more than any machine of ours has memory
@@ -26,26 +26,17 @@ READ_BY_THE_TEST = ("photos that are cached", "--set", "commands of a worker")
 PATIENCE = 60  # seconds until a reader is taken to wait for ever
 
 
-def _socket(file: Path) -> None:
-    """Put a socket there. Its path may be longer than sockets' may be."""
-    here = os.getcwd()
-    os.chdir(file.parent)
-    with socket.socket(socket.AF_UNIX) as made:
-        made.bind(file.name)
-    os.chdir(here)
-
-
 def _hole(file: Path, sample: bytes) -> None:
     file.write_bytes(sample)
     os.truncate(file, HOLE)
 
 
 KINDS: dict[str, Callable[[Path, bytes], object]] = {
-    "a pipe": lambda file, sample: os.mkfifo(file),
-    "a socket": lambda file, sample: _socket(file),
-    "a device": lambda file, sample: file.symlink_to("/dev/zero"),
-    "a file of the system": lambda file, sample: file.symlink_to("/proc/self/pagemap"),
-    "a folder": lambda file, sample: file.mkdir(),
+    "a pipe": lambda file, sample: put_link(file, "fifo"),
+    "a socket": lambda file, sample: put_link(file, "socket"),
+    "a device": lambda file, sample: put_link(file, "/dev/zero"),
+    "a file of the system": lambda file, sample: put_link(file, "/proc/self/pagemap"),
+    "a folder": lambda file, sample: put_link(file, ""),
     "a hole": _hole,
 }
 
