@@ -166,9 +166,9 @@ def with_masks(
 def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, float]:
     """Guess a box around the object: a cube around the point at which the cameras look.
 
-    `views` are the capture's views. If a view has a mask, the guess uses it. Returns the box, the fraction of each of its edges that the
-    object is likely to fill, and the radius of the region of interest in the capture's units. Raises InputError if the cameras look
-    outwards, as in a room.
+    The guess uses the cameras of `views` and the capture's point cloud, but no masks. Returns the box, the fraction of each of its edges
+    that the object is likely to fill, and the radius of the region of interest, in the units of the views' cameras. Raises InputError if
+    the cameras look outwards, as in a room.
     """
     found = find_region(views, up_direction(views), capture.points, [])
     if found.because == LOOK_OUT:

@@ -83,7 +83,7 @@ class State:
         return self.parts[kind]
 
     def needed(self, name: str) -> bool:
-        """Tell whether the scene needs the optional feature `name`, such as "exposure". True until that is decided (see `train/decide`)."""
+        """Tell whether the scene needs the optional feature `name` (see `train/decide`). True until that is decided."""
         return name not in self.needs or self.needs[name].needed
 
     @property
@@ -161,7 +161,7 @@ class State:
         return self.picture(inputs if surfels is None else inputs._replace(surfels=surfels), camera)
 
     def photo(self, view: int, whole: bool = False) -> Photo:
-        """Return a view's photo, not reduced. It is cropped to the pixels that the training uses, unless `whole` is true."""
+        """Return a view's photo as loaded. It is cropped to the pixels that the training uses, unless `whole` is true."""
         photo = self.photos[view]
         return photo if whole or self.crops is None else photo.part(*self.crops[view])
 
