@@ -54,9 +54,8 @@ def _relative(path: str, start: str) -> str:
 @bpy.app.handlers.persistent
 def _before_saving(file: str, *_) -> None:
     before, after = os.path.dirname(bpy.data.filepath), os.path.dirname(file)
-    if (
-        before
-    ):  # Blender makes the paths of images relative when a file is saved first, and then keeps relative ones right
+    if before:
+        # Blender makes the paths of images relative when a file is saved first, and then keeps relative ones right.
         runs = tuple(os.path.join(item[key], "") for item, key in _custom_properties() if key == FOLDER)
         for image in bpy.data.images:
             if image.library is None and image.filepath.startswith(runs):

@@ -44,13 +44,10 @@ def check_gltf(path: Path) -> None:
     """
     try:
         with open_file(path) as file:
-            head = file.read(
-                20
-            )  # "glTF", the version and the length; the length of the JSON and "JSON" (glTF 2.0, 4.4)
-            binary = head[:4] == b"glTF"
-            text = (
-                file.read(min(int.from_bytes(head[12:16], "little"), LARGEST)) if binary else head + file.read(LARGEST)
-            )
+            # "glTF", the version and the length; the length of the JSON and "JSON" (glTF 2.0, 4.4).
+            head = file.read(20)
+            length = min(int.from_bytes(head[12:16], "little"), LARGEST)
+            text = file.read(length) if head[:4] == b"glTF" else head + file.read(LARGEST)
         found = [json.loads(text)]
         while found:
             value = found.pop()

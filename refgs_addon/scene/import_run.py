@@ -163,9 +163,8 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
     bpy.context.view_layer.update()
     meshes = [item for item in added if item.type == "MESH"]
     for item in meshes:
-        matrix = (
-            item.matrix_world.copy()
-        )  # keep the transforms of the file's nodes, which become empty parents, and drop these
+        # Keep the transforms of the file's nodes, which become empty parents, and drop the parents.
+        matrix = item.matrix_world.copy()
         item.parent, item.matrix_world = None, matrix
         for other in item.users_collection:
             other.objects.unlink(item)

@@ -22,13 +22,7 @@ T = TypeVar("T")
 PICTURE_SUFFIXES = tuple(suffix for suffixes in FORMATS.values() for suffix in suffixes)
 IMAGE_SUFFIXES = (*PICTURE_SUFFIXES, ".exr", *RAW_SUFFIXES)  # where several files fit, the first is preferred
 PHOTO_FOLDERS = ("images", "input")
-MASK_FOLDERS = (
-    "masks",
-    "mask",
-    "alpha",
-    "images_mask",
-    "images_masks",
-)  # `masks` is ours, the others are other programs'
+MASK_FOLDERS = ("masks", "mask", "alpha", "images_mask", "images_masks")  # the first is ours, then other programs'
 _RANKS = {suffix: rank for rank, suffix in enumerate(IMAGE_SUFFIXES)}
 # Words by which other programs tell a mask from its photo, as in 0001_mask.png, mask_0001.png and 0001.jpg.mask.png.
 _MASK_WORDS = re.compile(r"(?:mask|alpha|matte)[-_. ](?P<after>.+)|(?P<before>.+)[-_. ](?:mask|alpha|matte)", re.I)

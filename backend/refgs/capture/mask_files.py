@@ -49,11 +49,8 @@ def _match(files: Files, folder: Path, root: Path, photos: list[Path]) -> dict[P
 
     `root` is the folder to which the photos' paths are relative.
     """
-    exact, worded, bare = (
-        {},
-        {},
-        {},
-    )  # by name without suffix; without the word "mask", too; without the photo's suffix, too
+    # Masks by their names: without suffix; without the word "mask", too; without the photo's suffix, too.
+    exact, worded, bare = {}, {}, {}
     for mask in files.all_images(folder):
         inner = mask.relative_to(folder).as_posix()
         exact[fold(os.path.splitext(inner)[0])] = mask

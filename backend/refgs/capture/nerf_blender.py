@@ -41,9 +41,8 @@ def published_normals(view: View, max_side: int | None = None) -> tuple[np.ndarr
     """
     if view.normal_path is None:
         return None
-    normals = (
-        read_image(view.normal_path, is_data=True)[0].astype(np.float32) / 127.5 - 1
-    )  # n/2 + 1/2, not sRGB-encoded
+    # Stored as n/2 + 1/2, not sRGB-encoded.
+    normals = read_image(view.normal_path, is_data=True)[0].astype(np.float32) / 127.5 - 1
     height, width = normals.shape[:2]
     camera = view.camera
     if (width, height) != (camera.width, camera.height):

@@ -203,9 +203,8 @@ def _unique_names(views: list[View]) -> list[View]:
     are not unique.
     """
     names = Counter((view.split, view.camera.name) for view in views)
-    top = os.path.commonpath(
-        [os.path.abspath(view.image_path.parent) for view in views]
-    )  # absolute, because a camera file may give some photos by absolute paths
+    # Absolute, because a camera file may give some photos by absolute paths.
+    top = os.path.commonpath([os.path.abspath(view.image_path.parent) for view in views])
 
     def name(view: View) -> str:
         if names[view.split, view.camera.name] == 1:

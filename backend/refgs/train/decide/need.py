@@ -36,9 +36,8 @@ class Decision(NamedTuple):
     figures: Mapping[str, float] = MappingProxyType({})
     statistic: float | None = None
     threshold: float | None = None
-    once: Callable[[], None] = (
-        lambda: None
-    )  # called once, when this is decided; its result is in checkpoints, or each start makes it again
+    # Called once, when this is decided. Its result is in checkpoints, or each start makes it again.
+    once: Callable[[], None] = lambda: None
 
 
 class Given(NamedTuple):

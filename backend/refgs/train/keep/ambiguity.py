@@ -108,9 +108,8 @@ def ambiguities(state: State) -> dict[str, dict]:
         found = {}
         for name, trade in TRADES.items():
             scenes = trade.change(now, SMALL * trade.size), trade.made_up(now, SMALL)
-            dots = torch.zeros(
-                2, 2, dtype=torch.double
-            )  # dot products of both changes, summed view by view, because photos may be large
+            # Dot products of both changes, summed view by view, because photos may be large.
+            dots = torch.zeros(2, 2, dtype=torch.double)
             for old, *pair in zip(before, *(_pictures(state, scene, chosen) for scene in scenes), strict=True):
                 changes = [((picture - old) / SMALL).double().flatten() for picture in pair]
                 dots += torch.tensor([[float(a @ b) for b in changes] for a in changes])

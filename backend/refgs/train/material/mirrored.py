@@ -100,9 +100,8 @@ def _fit(seen: Seen, mirrored: Iterable[list[Tensor]], positions: Tensor) -> Fit
     near, count = neighbours(positions, NEIGHBOURS), len(positions)
     names, shape = ("rest", "both", "power", "paint", "first"), (len(ROUGHNESSES), count, 3)
     sums = {name: torch.zeros(shape, dtype=torch.double) for name in names}
-    changes = torch.zeros(
-        count, 4, dtype=torch.double
-    )  # weighted sums: mirrored, shown, their product, the square of the mirrored
+    # Weighted sums: mirrored, shown, their product, the square of the mirrored.
+    changes = torch.zeros(count, 4, dtype=torch.double)
     for view, lights in enumerate(mirrored):
         shown, weight = seen.radiance[:, view], seen.weight[:, view, None].double()
         cosine = (seen.normal[:, view] * seen.towards[:, view]).sum(dim=1).clamp(GRAZING, 1)
