@@ -17,8 +17,10 @@ import torch._dynamo  # load Triton's LLVM before Mesa's, which Eevee uses: the 
 from benchmarks.scenes.analytic import write_ball_capture
 from refgs.kernels import load
 from tests.makers.emulate import emulate
+from tests.makers.foreign import use_foreign
 
 NO_CARD = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA card here")
+FOREIGN = [pytest.param(name, marks=pytest.mark.slow) for name in ("wine", "qemu")]
 CARDS = ["emulated", pytest.param("cuda", marks=NO_CARD)]
 
 
@@ -44,14 +46,17 @@ def card(request, monkeypatch) -> torch.device:
     return torch.device("cuda" if request.param == "cuda" else "cpu")
 
 
-@pytest.fixture(params=[*load.supported(), *CARDS])
+@pytest.fixture(params=[*load.supported(), *CARDS, *FOREIGN])
 def device(request, monkeypatch) -> torch.device:
     """Run the test once for each build of the kernels. Returns the torch device.
 
     The builds are: one for each instruction set of this CPU, CUDA kernels emulated on the CPU, and CUDA kernels on a card if there is one.
+    Slow tests add Windows' library under Wine, and ARM's under QEMU.
     """
     if request.param == "emulated":
         emulate(monkeypatch)
+    elif request.param in ("wine", "qemu"):
+        use_foreign(request.param, monkeypatch)
     elif request.param != "cuda":
         monkeypatch.setenv("REFGS_ISA", request.param)
     return torch.device("cuda" if request.param == "cuda" else "cpu")

@@ -157,6 +157,20 @@ def test_names_beyond_ascii(tmp_path, variables):
     assert status == WRONG and "there is no such folder" in said and said.count("\n") == 1
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have names in UTF-8 only")
+@pytest.mark.parametrize(
+    ("line", "mend"),
+    [
+        ("refgs report $'\\xe9'", "rename the file or folder"),
+        ("PYTHONUTF8=0 PYTHONCOERCECLOCALE=0 LC_ALL=C refgs report é", "choose a language with UTF-8"),
+    ],
+)
+def test_names_that_are_not_unicode(tmp_path, line, mend):
+    """Check that one line says so, where a library crashed."""
+    status, _, said = in_shell(tmp_path, line)
+    assert status == WRONG and f"this name is not Unicode: {mend}" in said and said.count("\n") == 1
+
+
 def test_a_process_terminates_itself_on_windows(monkeypatch):
     """Check that the handler of SIGTERM is called, which writes a checkpoint: Windows' `os.kill` would call none."""
     heard = []

@@ -17,7 +17,7 @@ from refgs.asked import Asked
 from refgs.errors import TRY_AGAIN, InputError, InputWarning, TryAgain, one_line
 from refgs.memory import check_limit, shortage_named
 from refgs.paths import disk_errors_named
-from refgs.process import check_current_folder, open_streams, terminate
+from refgs.process import check_arguments, check_current_folder, open_streams, terminate
 
 STATUSES = (
     "Exit status: 0 done; 1 a fault of the program; 2 the input is wrong, a retry is useless; "
@@ -292,6 +292,7 @@ def main() -> None:
         threading.Thread(target=_end_with_input, daemon=True).start()
     try:
         with shortage_named(), disk_errors_named([], "run the command again"):
+            check_arguments()
             check_current_folder()
             check_limit()
             app(standalone_mode=True)

@@ -75,6 +75,17 @@ def check_current_folder() -> None:
         ) from None
 
 
+def check_arguments() -> None:
+    """Raise InputError if an argument is not Unicode, or if the system's settings hide that it is: libraries fail at such a name."""
+    for word in sys.argv[1:]:
+        try:
+            word.encode()
+        except UnicodeEncodeError:
+            ascii_only = sys.getfilesystemencoding() == "ascii"
+            mend = "choose a language with UTF-8 (LC_ALL=C.UTF-8)" if ascii_only else "rename the file or folder"
+            raise InputError(f"{word}: this name is not Unicode: {mend}") from None
+
+
 def terminate() -> None:
     """Send SIGTERM to this process, from any of its threads."""
     if sys.platform == "win32":

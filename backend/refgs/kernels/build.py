@@ -142,6 +142,8 @@ def _compile(target: Target, library: Path) -> None:
         command += ["-target", target.platform, f"-mcpu={target.processor}"]
         if target.extension != "dll":
             command.append("-fPIC")
+        if target.extension == "so":
+            command.append("-Wl,-z,defs")  # every symbol is defined here, as elsewhere without being asked
         # Zig's own cache is deleted with the scratch folder: it takes tens of megabytes and saves nothing the next time.
         environment = os.environ | {"ZIG_LOCAL_CACHE_DIR": scratch, "ZIG_GLOBAL_CACHE_DIR": scratch}
         with subprocess.Popen(

@@ -1,4 +1,5 @@
-// Definitions for every exported function. No C library is used, so that results depend on the processor only.
+// Definitions for every exported function. No C library is used, so that results depend on the processor only. On macOS, memory is
+// copied and cleared by the system's.
 #pragma once
 
 #ifdef __CUDACC__

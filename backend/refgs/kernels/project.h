@@ -25,7 +25,19 @@ INLINE Bound round_up(Bound a) { return __builtin_elementwise_ceil(a); }
 INLINE Bound round_down(Bound a) { return __builtin_elementwise_floor(a); }
 INLINE Real root(Real a) { return __builtin_elementwise_sqrt(a); }
 INLINE Real inverse_root(Real a) { return 1 / root(a); }
-INLINE double logarithm(float x) { return __builtin_log(x); }
+// Natural logarithm, to 2 ulp; of what is not positive, minus infinity. x = 2^e m with sqrt(1/2) <= m < sqrt(2), and
+// log m = 2 artanh s = 2 (s + s^3/3 + s^5/5 + ...) with s = (m - 1) / (m + 1).
+INLINE double logarithm(float x) {
+  uint32_t bits;
+  __builtin_memcpy(&bits, &x, sizeof x);
+  int32_t e = (int32_t)(bits - 0x3f3504f3) >> 23;  // the bits of sqrt(1/2)
+  bits -= (uint32_t)e << 23;
+  float m;
+  __builtin_memcpy(&m, &bits, sizeof m);
+  double s = (m - 1.0) / (m + 1.0), square = s * s, sum = 1.0 / 19;
+  for (int k = 17; k > 0; k -= 2) sum = sum * square + 1.0 / k;
+  return x > 0 ? e * 0.69314718055994531 + 2 * s * sum : -__builtin_inf();
+}
 #endif
 INLINE Real larger(Real a, Real b) { return a > b ? a : b; }
 INLINE Real smaller(Real a, Real b) { return a < b ? a : b; }
