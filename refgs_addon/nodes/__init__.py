@@ -92,6 +92,6 @@ def object_frame(tree: bpy.types.NodeTree, item: bpy.types.NodeSocket) -> tuple[
 
 
 def max_component(tree: bpy.types.NodeTree, vector: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """Add nodes that compute max(|x|, |y|, |z|) of a vector, and return their output. It is at most 1 in the cube from -1 to 1."""
+    """Add nodes that compute max(|x|, |y|, |z|) of a vector, and return their output. The result is at most 1 in the cube from -1 to 1."""
     x, y, z = add(tree, "ShaderNodeSeparateXYZ", {0: vector_math(tree, "ABSOLUTE", vector)}).outputs
     return math(tree, "MAXIMUM", math(tree, "MAXIMUM", x, y), z)

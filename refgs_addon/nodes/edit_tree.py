@@ -1,6 +1,7 @@
 """Build the two node trees for edits. An edit is a modifier on the splats that changes their materials.
 
-One tree is the edit itself. The other copies the changes from the splats to the mesh. Both keep the materials learned from the photos.
+`edit_tree` is the edit itself. `mesh_edits_tree` copies the changes from the splats to the mesh. Neither overwrites the materials learned
+from the photos.
 """
 
 import bpy
@@ -145,7 +146,7 @@ def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.N
 
 
 def mesh_edits_tree() -> bpy.types.NodeTree:
-    """Make the node tree `RefGS Follow`, or return the existing one. It makes a mesh show the edits of the splats.
+    """Make the node tree `RefGS Follow`, or return the existing one. It makes a mesh show the edits of the splats' materials.
 
     Each vertex gets the edits of the splat nearest to it. Distances are measured in the local coordinates of the mesh and of the splats. So
     it does not matter where the two objects stand.
@@ -170,7 +171,10 @@ def mesh_edits_tree() -> bpy.types.NodeTree:
 
 
 def add_edits_to_material(material: bpy.types.Material) -> None:
-    """Add nodes to a mesh's material that blend the values of the edits over its textures. Does nothing if it has these nodes already."""
+    """Add nodes to a mesh's material that blend edited base colour, metallic and roughness over its textures.
+
+    Does nothing if the material has these nodes already.
+    """
     tree = material.node_tree
     if _MIXED in tree.nodes or not any(node.type == "BSDF_PRINCIPLED" for node in tree.nodes):
         return

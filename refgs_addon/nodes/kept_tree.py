@@ -1,4 +1,4 @@
-"""Build the geometry-nodes tree that deletes splats whose points were deleted from a mesh of points."""
+"""Build the geometry-nodes tree that hides deleted splats. The artist deletes a splat by deleting its vertex from a mesh of points."""
 
 import bpy
 

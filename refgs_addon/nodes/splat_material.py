@@ -43,7 +43,7 @@ def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material
 
 
 def connect_edits(material: bpy.types.Material) -> None:
-    """Change a material of `splat_material` so that it shows edits of the splats.
+    """Change a material of `splat_material` so that it shows edits: modifiers that change the splats' materials.
 
     Afterwards, the material reads metallic and roughness from each splat, even if it had one value for all splats before. With a specular
     of 0, the roughness of a non-metal would have no effect. So splats with edited roughness also get a specular above 0.

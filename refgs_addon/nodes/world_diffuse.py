@@ -1,9 +1,9 @@
 """Correct the diffuse light of the world in Eevee, by a node group that the materials of runs share.
 
-For diffuse surfaces, Eevee keeps only the first two bands of spherical harmonics of the world's light. It weakens the second band if the
-sum of both could be negative. So the bright side of an object is up to a third too dark, and its dark side is too bright. The group
-multiplies the base colour by the true irradiance divided by Eevee's. Three bands give the true irradiance to a percent (Ramamoorthi and
-Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps").
+For diffuse surfaces, Eevee keeps only the first two bands (degrees 0 and 1) of spherical harmonics of the world's light. It weakens the
+second band if the sum of both could be negative. So the bright side of an object is up to a third too dark, and its dark side is too
+bright. The group multiplies the base colour by the true irradiance divided by Eevee's. Three bands give the true irradiance to a percent
+(Ramamoorthi and Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps").
 """
 
 from collections.abc import Sequence
@@ -24,9 +24,9 @@ _WINDOW = "Eevee's Second Band"
 def world_diffuse_group() -> bpy.types.ShaderNodeTree:
     """Make the node group `RefGS World Diffuse`, or return the existing one. It changes nothing until `set_harmonics` is called.
 
-    Inputs: Base Color; Metallic, Normal (world space) and Occlusion (1 is open) of the surface. Output: the base colour for Eevee.
-    Occlusion darkens the world's diffuse light, which Eevee does not shadow. Metals have no diffuse light, and keep their colour. In other
-    engines a driver switches the group off.
+    Inputs: the surface's Base Color, Metallic, Normal (world space) and Occlusion (1 where nothing blocks the light). Output: the base
+    colour for Eevee. Occlusion darkens the world's diffuse light, which Eevee does not shadow. Metals have no diffuse light, and keep their
+    colour. In other engines a driver switches the group off.
     """
     if NAME in bpy.data.node_groups:
         return bpy.data.node_groups[NAME]
@@ -81,7 +81,10 @@ def _term(number: int) -> str:
 
 
 def _switch_off_elsewhere(value: bpy.types.NodeSocket) -> None:
-    """Drive a Value node: 1 if Eevee renders the scene, otherwise 0. The expression is so simple that Blender needs no Python for it."""
+    """Drive a Value node: 1 if Eevee renders the scene, otherwise 0.
+
+    Blender can evaluate the driver without Python, because its expression is only a comparison.
+    """
     driver = value.driver_add("default_value").driver
     variable = driver.variables.new()
     variable.name, variable.type = "engine", "CONTEXT_PROP"
@@ -91,10 +94,10 @@ def _switch_off_elsewhere(value: bpy.types.NodeSocket) -> None:
 
 
 def set_harmonics(tree: bpy.types.ShaderNodeTree, harmonics: Sequence[Sequence[float]], window: float) -> None:
-    """Set the world's light. `harmonics` are nine coefficients (9, 3) of its irradiance over π, in linear Rec.709.
+    """Set the world's light in the node group `tree`. `harmonics` are nine coefficients (9, 3) of the irradiance over π, in linear Rec.709.
 
     Their order is 1; x, y, z; xy, yz, 3z² − 1, xz, x² − y². This function multiplies them by the harmonics' constants, BANDS and THIRD.
-    `window` is the factor by which Eevee weakens the second band.
+    `window` is the factor by which Eevee weakens the second band: x, y, z.
     """
     constants = (BANDS[0], *[BANDS[1]] * 3, *THIRD)
     for number, (rgb, constant) in enumerate(zip(harmonics, constants, strict=True)):
@@ -126,8 +129,8 @@ def add_world_diffuse(material: bpy.types.Material, occlusion: bpy.types.NodeSoc
 def surface_inputs(material: bpy.types.Material) -> dict[str, list[bpy.types.NodeSocket]]:
     """Find the sockets that take a material's base colour, metallic and roughness.
 
-    Returns lists of sockets under the names of the Principled BSDF's inputs, such as "Base Color". If the material has the group
-    `RefGS World Diffuse`, its inputs are listed: Base Color in place of the BSDF's, Metallic in addition.
+    Returns lists of sockets under the names of the Principled BSDF's inputs, such as "Base Color". If the material has the group `RefGS
+    World Diffuse`, the group's Base Color replaces that of the BSDF, and its Metallic is listed after that of the BSDF.
     """
     shader, node = principled(material), material.node_tree.nodes.get(NAME)
     found = {name: [shader.inputs[name]] for name in ("Base Color", "Metallic", "Roughness")}

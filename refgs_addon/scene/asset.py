@@ -1,4 +1,4 @@
-"""Make an imported run an asset, which Blender's asset browser shows by a picture."""
+"""Mark an imported run as an asset, with a preview picture for Blender's asset browser."""
 
 import tempfile
 from pathlib import Path

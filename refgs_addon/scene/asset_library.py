@@ -1,4 +1,7 @@
-"""Make the runs of a batch assets: a folder of .blend files, one a run, which Blender's asset browser shows as a library."""
+"""Turn the finished runs of a batch into an asset library: a folder of .blend files, one for each run.
+
+A batch trains all captures of a folder (`scene.many`). Blender's asset browser shows the library.
+"""
 
 from pathlib import Path
 
@@ -17,12 +20,12 @@ _HEADER = "# This is an Asset Catalog Definition file for Blender.\n\nVERSION 1\
 
 
 def missing_assets(folder: Path) -> list[Row]:
-    """List the finished runs of the batch in a folder that are not in its library."""
+    """List the finished runs of a batch that have no asset in the batch's library yet. `folder` is the folder of the batch's runs."""
     return [row for row in read_rows(folder) if row.state == "done" and not asset_file(folder, row.name).exists()]
 
 
 def asset_file(folder: Path, name: str) -> Path:
-    """Return the path of the .blend file of a run's asset. `folder` is that of the batch."""
+    """Return the path of the .blend file for the asset of the run `name`. `folder` is the folder of the batch's runs."""
     return folder / LIBRARY / f"{name}.blend"
 
 
@@ -34,8 +37,8 @@ def library_name(folder: Path) -> str:
 def import_as_assets(folder: Path) -> jobs.Job:
     """Start a job that makes each finished run of a batch an asset, and then lists the library in Blender's preferences.
 
-    Files that are in the library already are not written again. The job runs in another Blender process, so the open file does not change.
-    Raises InputError if there is no run to import, or if such a job for this batch is running already.
+    `folder` is the folder of the batch's runs. Runs that are in the library already are left out. The job runs in another Blender process,
+    so the open file does not change. Raises InputError if there is no run to import, or if such a job for this batch is running already.
     """
     from .render_process import start_blender
 
@@ -55,7 +58,7 @@ def import_as_assets(folder: Path) -> jobs.Job:
 
 
 def write_asset(run: Path, picture: Path | None, file: Path) -> None:
-    """Import a run folder and write it as an asset into a .blend file. The open file is replaced by an empty one.
+    """Import a run folder and write it as an asset into a .blend file. This first replaces the open file by an empty one.
 
     The asset is the run's collection, without its cameras and light. `picture` becomes its preview. Raises InputError if the run cannot be
     read or the file not be written.
@@ -84,9 +87,9 @@ def write_asset(run: Path, picture: Path | None, file: Path) -> None:
 
 
 def add_catalog(library: Path) -> None:
-    """Add the catalog "RefGS" to the file in which Blender finds the catalogs of `library`. Catalogs added by the artist stay.
+    """Add the catalog "RefGS" to the folder `library` of an asset library. Catalogs that the artist added stay.
 
-    Raises InputError if the file cannot be written.
+    Blender reads the catalogs of a library from a text file in its folder. Raises InputError if the file cannot be written.
     """
     file = library / _CATALOGS
     try:
@@ -99,7 +102,10 @@ def add_catalog(library: Path) -> None:
 
 
 def add_library(folder: Path) -> None:
-    """Add the library of the batch in a folder to the asset libraries of Blender's preferences, unless it is listed already."""
+    """Add a batch's library to the asset libraries in Blender's preferences, unless it is listed there already.
+
+    `folder` is the folder of the batch's runs.
+    """
     preferences, path = bpy.context.preferences, (folder / LIBRARY).resolve()
     known = preferences.filepaths.asset_libraries
     if all(Path(bpy.path.abspath(library.path)).resolve() != path for library in known):

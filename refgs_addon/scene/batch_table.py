@@ -1,4 +1,7 @@
-"""Read the table that a batch writes, with a row for each run, and hold it for the panel."""
+"""Read the table that a batch writes, with a row for each run, and copy it into the panel's list.
+
+A batch trains all captures of a folder (`scene.many`).
+"""
 
 import math
 from pathlib import Path
@@ -25,10 +28,10 @@ _shown: tuple[Path, object] | None = None
 
 
 class Row(NamedTuple):
-    """Hold a batch's row on one run. `state` is "waiting", "running", "done", "failed" or "stopped".
+    """Hold the row about one run in a batch's table. `state` is "waiting", "running", "done", "failed" or "stopped".
 
-    `words` says how far the run is, or which figures it reached. `what` says which step failed and why. `log` and `picture` are paths of
-    files in the batch's folder, "" if there is none.
+    `words` is the progress or the result in a few words, such as "training, 42 %" or "31.2 dB, 3.4 min". `what` says which step failed and
+    why. `log` and `picture` are paths of files in the batch's folder, or "" without such a file.
     """
 
     name: str
@@ -40,9 +43,9 @@ class Row(NamedTuple):
 
 
 def read_rows(folder: Path) -> list[Row]:
-    """Read the rows of the batch whose runs are in a folder. There are none if there was no batch. Damaged rows are left out.
+    """Read the table of a batch. `folder` is the folder of the batch's runs. Returns [] if no batch was started there.
 
-    If no process works on the batch any more, runs that have not ended are "stopped".
+    Damaged rows are left out. If no process works on the batch any more, runs that have not ended are "stopped".
     """
     try:
         found = read_json(folder / jobs.LOGS / ROWS)["rows"]
@@ -62,7 +65,7 @@ def read_rows(folder: Path) -> list[Row]:
 
 
 def _inside(folder: Path, path: object, endings: tuple[str, ...]) -> str:
-    """Return the path of a file if it is one in the batch's folder, with one of these endings, otherwise "".
+    """Return `path` if it is an existing file in the batch's `folder` with one of the suffixes `endings`. Otherwise return "".
 
     The panel opens the file with the system's default program. Without this check, a damaged table could make it run any program.
     """
@@ -72,7 +75,7 @@ def _inside(folder: Path, path: object, endings: tuple[str, ...]) -> str:
 
 
 def _words(state: str, facts: dict) -> str:
-    """Describe a run in a few words, such as "training, 42 %" or "31.2 dB, 3.4 min"."""
+    """Describe a run's progress or result, such as "training, 42 %" or "31.2 dB, 3.4 min". `facts` is the run's row in the table file."""
     if state == "running":
         part = facts["part"]
         step = _STEPS.get(facts["step"], str(facts["step"]))
@@ -85,7 +88,7 @@ def _words(state: str, facts: dict) -> str:
 
 
 def show_table(folder: Path) -> bool:
-    """Copy the rows of a batch into the list that the panel draws, if its file or state has changed. Return True if rows were copied."""
+    """Copy a batch's table into the panel's list if the table file or the batch's state has changed. Return True if rows were copied."""
     global _shown
     try:
         changed = (folder / jobs.LOGS / ROWS).stat().st_mtime_ns
@@ -120,6 +123,6 @@ def chosen_row(folder: Path) -> bpy.types.PropertyGroup | None:
 
 
 def forget_table() -> None:
-    """Forget which table the panel shows, because its list is removed."""
+    """Forget which batch's table is in the panel's list. The add-on calls this when it removes the list."""
     global _shown
     _shown = None

@@ -18,8 +18,9 @@ PHOTO = "refgs_photo"  # custom property of a camera's data: the file of its pho
 def read_cameras(path: Path, capture: Path | None) -> list[dict]:
     """Read the cameras of a cameras.json. Returns one dictionary for each photo.
 
-    Each dictionary has the camera-to-world matrix with OpenGL's axes and the pinhole intrinsics. Its key `photo` is the path of the photo
-    in the folder `capture`, or "" if `capture` is None. Raises InputError if the file cannot be read, or RefGS did not write it.
+    Each dictionary has `transform_matrix` (4 × 4, camera to world, OpenGL's axes) and the pinhole intrinsics `fl_x`, `fl_y`, `cx`, `cy`,
+    `w` and `h` in pixels. `name` is the name of the view. `photo` is the path of the photo in the folder `capture`, or "" if `capture` is
+    None. Raises InputError if the file cannot be read, or RefGS did not write it.
     """
     data = read_json(path)
     try:
@@ -42,9 +43,9 @@ def read_cameras(path: Path, capture: Path | None) -> list[dict]:
 
 
 def light_of(path: Path) -> str:
-    """Read from cameras.json which photo the recovered light belongs to. Returns the photo's name, or "" if the light fits all photos.
+    """Read from cameras.json for which view the recovered light is right. Returns the view's name, or "" if it is right for all views.
 
-    If the light turned with the camera, it had another rotation in each photo. Then the run's panorama fits only the named photo.
+    A light that turned with the camera had another rotation in each photo. The run's panorama is then right only for the named view.
     """
     found = read_json(path)
     name = found.get("light_of", "") if isinstance(found, dict) else ""

@@ -1,4 +1,4 @@
-"""Choose colour spaces by what they are, not by Blender's names for them: studios' OpenColorIO configs have other names."""
+"""Choose colour spaces by lists of their possible names, because each OpenColorIO config names them differently."""
 
 import bpy
 
@@ -34,12 +34,15 @@ _VIEWS = ("Standard", "Un-tone-mapped")
 
 
 def set_color_space(image: bpy.types.Image, names: tuple[str, ...]) -> bool:
-    """Set an image's colour space to the first of `names` that the config has. Return False, and change nothing, if it has none."""
+    """Set an image's colour space to the first of `names` that the OpenColorIO config has. If there is none, return False."""
     return _set_first(image.colorspace_settings, "name", names)
 
 
 def set_srgb_view(scene: bpy.types.Scene) -> None:
-    """Show a scene on an sRGB display without tone mapping, and without a look. Where the config has no such view, the scene's stays."""
+    """Show a scene on an sRGB display without tone mapping, look, exposure or gamma correction.
+
+    If the OpenColorIO config has no such display or view, the scene keeps its own.
+    """
     view = scene.view_settings
     _set_first(scene.display_settings, "display_device", _DISPLAYS)
     _set_first(view, "view_transform", _VIEWS)

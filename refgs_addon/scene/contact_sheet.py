@@ -27,8 +27,8 @@ def contact_sheet(
 
     Each HDRI gives one picture. The light recovered from the photos, if there is one, gives the first picture. The pictures lie in rows on
     a transparent, roughly square sheet. `size` is the longer side of each picture in pixels. `progress` is called with the number of
-    finished pictures and the name of the next light. The scene's light is restored. Raises InputError if there is no camera, a light cannot
-    be read, or the file cannot be written.
+    finished pictures and the name of the next light. The scene's light is restored. Raises InputError if there is no camera, if there is no
+    light, if a light cannot be read, or if the file cannot be written.
     """
     import numpy as np
 

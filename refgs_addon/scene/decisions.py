@@ -1,4 +1,8 @@
-"""Read the decisions of a training about a scene, with pictures of both answers, and train again with the other answer."""
+"""Read the decisions of a run: which optional parts of the training, such as specular reflection, it kept or left out.
+
+Each decision has pictures rendered with and without the part. The artist can confirm a decision, or train again with the opposite one
+(`training.train_other_way`).
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +17,11 @@ ON_OFF = ("on", "off")  # words of the trainer's settings [needs]
 
 @dataclass(frozen=True)
 class Decision:
-    """Store a decision that the trainer wrote to a run's needs.json (see docs/run-folder.md).
+    """Hold a decision about an optional part of the training, such as specular reflection, from a run's needs.json.
 
-    `need` names an optional part of the training, and `needed` says whether it was kept. `pictures` maps "on", "off" and "photo" to files,
-    all of the view `view`. `psnr` maps "on" and "off" to the PSNR of the two pictures against the photo, in dB.
+    `need` is the part's name in the trainer's settings, `what` its name in words. `needed` says whether the part was kept, and `why` gives
+    the reason. `pictures` maps "on" (rendered with the part), "off" (without it) and "photo" to files. All three show the view `view`.
+    `psnr` maps "on" and "off" to the PSNR of these two pictures against the photo, in dB.
     """
 
     need: str
@@ -40,7 +45,11 @@ _read: dict[Path, tuple[int, list[Decision]]] = {}  # by needs.json: when it was
 
 
 def decisions(folder: Path) -> list[Decision]:
-    """List the decisions of a run that have pictures, also during its training. Return [] if needs.json is absent or broken."""
+    """List a run's decisions on optional parts of the training (see `Decision`). Decisions without pictures are left out.
+
+    Returns [] if needs.json is absent or broken. A training writes its decisions as soon as they are made, so this works before the
+    training has ended.
+    """
     file = folder / "needs.json"
     try:
         written = file.stat().st_mtime_ns
@@ -74,7 +83,7 @@ def _parse(folder: Path, file: Path) -> list[Decision]:
 
 
 def find_decision(folder: Path, need: str) -> Decision:
-    """Find a run's decision about a need. Raises InputError if the run has no such decision with pictures."""
+    """Find a run's decision about the optional part `need` of the training. Raises InputError if there is none with pictures."""
     for decision in decisions(folder):
         if decision.need == need:
             return decision
@@ -82,16 +91,16 @@ def find_decision(folder: Path, need: str) -> Decision:
 
 
 def open_decisions(scene: bpy.types.Scene, folder: Path) -> list[Decision]:
-    """List the decisions of a run that the artist has not confirmed in this scene."""
+    """List those decisions of a run (see `Decision`) that the artist has not confirmed in this scene."""
     known = next((known for known in scene.refgs.runs if Path(known.folder) == folder), None)
     confirmed = set(known.confirmed.split()) if known else set()
     return [decision for decision in decisions(folder) if f"{decision.need}={decision.answer}" not in confirmed]
 
 
 def confirm(scene: bpy.types.Scene, folder: Path, need: str) -> None:
-    """Note in the scene's list of runs that the artist keeps a run's decision. `open_decisions` then no longer lists the decision.
+    """Note in the scene's list of runs that the artist agrees with a run's decision on the optional part `need` of the training.
 
-    Raises InputError if the run has no such decision with pictures.
+    `open_decisions` then no longer lists the decision. Raises InputError if the run has no such decision with pictures.
     """
     decision = find_decision(folder, need)
     for known in scene.refgs.runs:

@@ -8,9 +8,9 @@ from .run_parts import stand_with
 
 
 def add_points(splats: bpy.types.Object) -> bpy.types.Object:
-    """Add a mesh with a vertex at each splat, or return the existing one. Splats whose vertices are deleted there are not drawn.
+    """Add a mesh with a vertex at each splat, or return the existing one. A splat is not drawn if its vertex is deleted from this mesh.
 
-    Vertices are selected and deleted with Blender's own tools, in Edit Mode. `splats` is the run's object.
+    The artist selects and deletes vertices with Blender's own tools, in Edit Mode. `splats` is the object of the run's point cloud.
     """
     if (points := points_of(splats)) is not None:
         return points

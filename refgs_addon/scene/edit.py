@@ -19,9 +19,9 @@ def add_edit(
     """Add an edit, a modifier that changes the splats' materials, after the earlier edits of a run. The mesh shows the edit too.
 
     `collection` is the run's. `where` selects the splats, as in `nodes.edit_tree`: "Everywhere", "Box", "Sphere", "Similar" or "Painted".
-    "Box", "Sphere" and "Similar" get an Empty in the middle of the splats, which the artist moves, rotates and scales. "Painted" gets a
-    copy of the mesh on which the artist paints. `material` is the name of a material preset. Raises InputError if the collection has no
-    splats, or no mesh for "Painted".
+    "Box", "Sphere" and "Similar" get an Empty in the middle of the splats, which the artist moves, rotates and scales. "Painted" gets an
+    object with the shape of the mesh, on which the artist paints. `material` is the name of a material preset. Raises InputError if the
+    collection has no splats, if it has no mesh for "Painted", or if the preset is missing or invalid.
     """
     if where not in REGIONS:
         raise InputError(f"there is no region {where}: choose one of {', '.join(REGIONS)}")
@@ -58,7 +58,10 @@ def is_edited(splats: bpy.types.Object) -> bool:
 
 
 def remove_edit(splats: bpy.types.Object, name: str) -> None:
-    """Remove an edit. Also remove the object that marks where it applies, unless another edit uses this object, too."""
+    """Remove the edit (modifier) `name`. Also remove the object that marks its region, unless another edit uses this object.
+
+    Raises InputError if the splats have no such edit.
+    """
     edit = splats.modifiers.get(name)
     if edit is None or edit not in edits(splats):
         raise InputError(f"{splats.name} has no edit {name}")
@@ -80,7 +83,7 @@ def splats_of(collection: bpy.types.Collection) -> bpy.types.Object:
 def _region(splats: bpy.types.Object, collection: bpy.types.Collection, where: str) -> bpy.types.Object:
     """Make an Empty in the middle of the splats that marks where an edit applies.
 
-    It is a third as large as all splats together. For "Similar", which needs only one point, it is a sixth as large.
+    Its sides are a third of the longest side of the box around the splats. For "Similar", which needs only one point, they are a sixth.
     """
     shape = {"Box": "CUBE", "Sphere": "SPHERE", "Similar": "ARROWS"}[where]
     region = add_region(splats, collection, f"{where} of {splats.name}", shape)

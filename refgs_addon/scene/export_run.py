@@ -26,7 +26,8 @@ DARK = 0.02  # a darker base colour does not reveal how much light falls on it
 def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
     """Return the splats' materials after all edits: base_color (N, 3) linear Rec.709, metallic (N,), roughness (N,).
 
-    N is the number of splats that were not deleted. `row` (N,) is the index that each of them has among all splats of the run.
+    N is the number of splats that were not deleted. A fourth array, `row` (N,), has the index of each of these splats among all splats of
+    the run.
     """
     drawing = splats.modifiers[SPLATS]
     before = drawing.show_viewport, splats.hide_viewport, splats.hide_get()
@@ -54,7 +55,8 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
 
     The new file is a copy of the run's file without deleted splats and with the edited materials. Each splat also has a fixed colour
     (f_dc), for viewers without lights. Where an edit changes the base colour, the fixed colour changes by the same factor. Raises
-    InputError if the run's file is missing or has changed, or the new file cannot be written.
+    InputError if the run's file is missing, has changed or has no materials, if all splats are deleted, or if the new file cannot be
+    written.
     """
     splats = splats_of(collection)
     source = run_folder(collection) / "splats.ply"
@@ -96,10 +98,10 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
 
 
 def export_run(collection: bpy.types.Collection, folder: Path) -> None:
-    """Write a run with its edits as a new run folder, which must not exist. The run itself does not change.
+    """Write a run with its edits as a new run folder. The run itself does not change.
 
     If the run was edited, its mesh is not copied, because its shape and textures do not contain the edits. `refgs export` or the trainer
-    makes a new mesh.
+    makes a new mesh. Raises InputError if the new folder exists already or cannot be written, or if the splats cannot be exported.
     """
     original = run_folder(collection)
     if folder.exists():
@@ -135,9 +137,10 @@ def export_light(collection: bpy.types.Collection, path: Path) -> None:
 
 
 def export_mesh(collection: bpy.types.Collection, path: Path, engine: str = "Any Program") -> None:
-    """Write a run's mesh with its textures. A .glb is a copy of the run's file; `mesh_exchange` writes .usdc and .fbx for `engine`.
+    """Write a run's mesh with its textures, as .glb, .usdc or .fbx. A .glb is a copy of the run's file.
 
-    Raises InputError if the run has no mesh, or if the run was edited: the mesh does not contain the edits.
+    `mesh_exchange.write_mesh` writes the other two, with the extra textures that the game engine `engine` needs. Raises InputError if the
+    run has no mesh, or if the run was edited: the mesh does not contain the edits.
     """
     mesh = run_folder(collection) / "mesh.glb"
     if is_edited(splats_of(collection)):

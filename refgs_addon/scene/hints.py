@@ -1,4 +1,7 @@
-"""Find the part of a run that the artist calls metal or paint, and write it as a hint for the trainer."""
+"""Find the splats that the artist calls metal or paint, and write them as a hint for the trainer.
+
+The trainer keeps the hinted splats metal or paint when it trains again.
+"""
 
 import json
 from pathlib import Path
@@ -49,10 +52,10 @@ def chosen_part(splats: bpy.types.Object, active: bpy.types.Object | None) -> np
 
 
 def part_at(splats: bpy.types.Object, origin: Vector, direction: Vector) -> np.ndarray:
-    """Return the positions (P, 3) of the splats of the part that a ray hits first, in the splats' coordinates.
+    """Return the positions (P, 3), in the splats' coordinates, of all splats that belong to the part of the surface that a ray hits first.
 
-    The ray is in world space. A part ends at creases. Changes of the trained material do not end a part, because that material may be
-    wrong. Raises InputError if the ray hits no splat.
+    A part is a piece of the surface without creases. Changes of the trained material do not end a part, because that material may be wrong.
+    `origin` and `direction` of the ray are in world space. Raises InputError if the ray hits no splat.
     """
     inverse = _to_world(splats).inverted_safe()
     seed = _hit(splats, np.array(inverse @ origin), np.array(inverse.to_3x3() @ direction))
@@ -62,7 +65,10 @@ def part_at(splats: bpy.types.Object, origin: Vector, direction: Vector) -> np.n
 
 
 def write_hint(file: Path, kind: str, points: np.ndarray) -> None:
-    """Write a file of hints for the trainer: the splats at `points` (P, 3) are of this kind, "metal" or "paint"."""
+    """Write a hint for the trainer to a JSON file: the splats at the positions `points` (P, 3) are of the `kind` "metal" or "paint".
+
+    Raises InputError for another kind, or if the file cannot be written.
+    """
     if kind not in KINDS:
         raise InputError(f"a part cannot be {kind}: choose one of {', '.join(KINDS)}")
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -71,7 +77,7 @@ def write_hint(file: Path, kind: str, points: np.ndarray) -> None:
 
 
 def _hit(splats: bpy.types.Object, origin: np.ndarray, direction: np.ndarray) -> int | None:
-    """Return the index of the splat at which half of the light along a ray is blocked.
+    """Return the index of the splat at which half of the light along a ray is blocked. The ray is in the splats' coordinates.
 
     If all splats together block less, return the last one that the ray hits. Return None if it hits no splat.
     """
@@ -93,10 +99,10 @@ def _hit(splats: bpy.types.Object, origin: np.ndarray, direction: np.ndarray) ->
 
 
 def _smooth_part(splats: bpy.types.Object, seed: int) -> np.ndarray:
-    """Mark the splats (N,) that belong to the same part as the splat `seed`: a surface without creases connects them.
+    """Find the splats that a surface without creases connects to the splat with the index `seed`. Returns a mask (N,).
 
-    Neighbours are connected if their normals agree, and if the line between them runs along the surface. A splat also belongs to the part
-    if most of its neighbours do. A faint splat belongs to the part if the nearest solid splat does.
+    Neighbours are connected if their normals agree, and if the line between them runs along the surface. A splat is also selected if most
+    of its neighbours are. A faint splat is selected if the nearest solid splat is.
     """
     position, normal = (_attribute(splats, name, "vector", 3) for name in ("position", "normal"))
     solid = _attribute(splats, "opacity", "value", 1)[:, 0] >= SOLID
@@ -126,13 +132,13 @@ def _smooth_part(splats: bpy.types.Object, seed: int) -> np.ndarray:
 
 
 def _to_world(splats: bpy.types.Object) -> Matrix:
-    """Return the matrix from the splats' coordinates to world space. Blender does not update `matrix_world` of splats that are hidden."""
+    """Return the matrix from the splats' coordinates to world space. It is right for hidden splats, too, unlike their `matrix_world`."""
     local = splats.matrix_parent_inverse @ splats.matrix_basis
     return splats.parent.matrix_world @ local if splats.parent else splats.matrix_basis.copy()
 
 
 def _attribute(splats: bpy.types.Object, name: str, field: str, width: int) -> np.ndarray:
-    """Read an attribute of the splats as float32 (N, width)."""
+    """Read an attribute of the splats as float32 (N, width). `field` is the property that has its values: "vector" or "value"."""
     attribute = splats.data.attributes[name]
     values = np.empty(width * len(attribute.data), np.float32)
     attribute.data.foreach_get(field, values)

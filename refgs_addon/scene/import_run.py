@@ -48,9 +48,9 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
 
     splats.ply must exist. mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be missing. If there is a mesh,
     it is shown and the splats are hidden: Blender shades each splat by itself, which looks grainy on polished surfaces. `run_parts.show`
-    shows the splats; the mesh casts their shadows. `trace_rays` sets up Eevee and Cycles. The cameras are hidden. An Empty is the parent of
-    all objects. If `capture_cameras.show_cameras` added the cameras of the same capture, the run's cameras replace them. If this function
-    raises InputError, it leaves the open file unchanged.
+    switches between the two. The cameras are hidden. An Empty is the parent of all objects. `trace_rays` sets up Eevee and Cycles. If
+    `capture_cameras.show_cameras` added the cameras of the same capture, the run's cameras replace them. If this function raises
+    InputError, it leaves the open file unchanged.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -105,7 +105,7 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
 
 
 def add_root(name: str, splats: bpy.types.Object, mesh: list[bpy.types.Object]) -> bpy.types.Object:
-    """Add the Empty that moves, rotates and scales a run. It stands at the middle of the object's lowest side."""
+    """Add the Empty that moves, rotates and scales a run. It stands at the centre of the bottom of the box around the run."""
     low, high = extent(splats, mesh)
     item = bpy.data.objects.new(name, None)
     item.location = (low.x + high.x) / 2, (low.y + high.y) / 2, low.z
@@ -130,10 +130,11 @@ def put_under(meshes: list[bpy.types.Object], splats: bpy.types.Object) -> None:
 
 
 def trace_rays(scene: bpy.types.Scene) -> None:
-    """Make a scene fit for a run: switch on Eevee's ray tracing, and let rays in Cycles pass at least LAYERS transparent quads.
+    """Set up a scene's render engines for a run: ray tracing in Eevee, and at least LAYERS transparent bounces in Cycles.
 
-    The object then mirrors and darkens itself in Eevee, too. Rays are traced at full resolution and not denoised, because half the
-    resolution and Blender's denoising both make chrome and glossy paint look dull. If ray tracing is already on, its options stay.
+    With ray tracing, Eevee also shows the object's reflections and shadows on itself. Rays are traced at full resolution and not denoised,
+    because half the resolution and Blender's denoising both make chrome and glossy paint look dull. If ray tracing is already on, its
+    options stay.
     """
     if not scene.eevee.use_raytracing:
         scene.eevee.use_raytracing = True
@@ -144,9 +145,10 @@ def trace_rays(scene: bpy.types.Scene) -> None:
 
 
 def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Import a GLB with Blender's importer, and move its meshes into the collection.
+    """Import a GLB with Blender's importer, and move its meshes into the collection. Returns the mesh objects.
 
-    Vertices that the file doubles at the seams of the textures are merged, so that the mesh is closed.
+    Vertices that the file doubles at the seams of the textures are merged, so that the mesh is closed. Raises InputError if the file cannot
+    be imported or contains no mesh.
     """
     check_gltf(path)
     before, units = set(bpy.data.objects), bpy.context.scene.unit_settings
@@ -186,7 +188,10 @@ def _doubt_words(folder: Path) -> str:
 
 
 def _occlusion(material: bpy.types.Material) -> bpy.types.NodeSocket | None:
-    """Find the socket that has the occlusion, in a material that Blender's glTF importer made. Blender does not render this occlusion."""
+    """Find the output socket with the ambient occlusion in a material that Blender's glTF importer made. Returns None if it has none.
+
+    The importer links this output to a group node that Blender does not render.
+    """
     inputs = (node.inputs.get("Occlusion") for node in material.node_tree.nodes if node.type == "GROUP")
     return next((socket.links[0].from_socket for socket in inputs if socket and socket.links), None)
 

@@ -46,9 +46,9 @@ def is_watched(job: jobs.Job) -> bool:
 
 
 def update() -> None:
-    """Show the surfels of each training's newest preview. Remove the surfels of ended trainings. A timer calls this function.
+    """Show the newest preview of each watched training: the surfels that it wrote last. Remove the surfels of ended trainings.
 
-    A background thread reads the files, so that this function returns at once.
+    A timer calls this function. A background thread reads the files, so that this function returns at once.
     """
     for live in list(_shown):
         deleted = live.item not in bpy.data.objects

@@ -11,7 +11,10 @@ from ..preferences import log_file, python
 
 
 def results_folder(scene: bpy.types.Scene) -> Path | None:
-    """Return the folder for the runs: the artist's choice, or else one beside the captures. Return None if no captures are chosen."""
+    """Return the folder for the runs: the artist's choice, or else one beside the folder of captures.
+
+    Returns None if the artist has chosen neither.
+    """
     settings = scene.refgs.many
     if settings.results:
         return Path(bpy.path.abspath(settings.results))
@@ -20,9 +23,10 @@ def results_folder(scene: bpy.types.Scene) -> Path | None:
 
 
 def train_many(scene: bpy.types.Scene) -> jobs.Job:
-    """Start a job that trains on all captures of the scene's folder, or resumes such a job. `batch_table` shows its progress.
+    """Start a batch: a job that trains on all captures of the scene's folder. `batch_table` shows its progress.
 
-    Raises InputError if there is no trainer or no folder of captures, or if a batch is already running in the folder for the runs.
+    Steps that an earlier batch completed in the folder for the runs are not repeated. Raises InputError if there is no trainer or no folder
+    of captures, or if a batch is already running in the folder for the runs.
     """
     captures, out = _captures(scene), results_folder(scene)
     if captures is None:

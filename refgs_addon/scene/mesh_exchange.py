@@ -95,7 +95,11 @@ def _material(name: str, folder: Path, specular: float) -> bpy.types.Material:
 
 
 def _pack(path: Path, folder: Path, channels: tuple[tuple[str, int], ...]) -> None:
-    """Write a PNG whose channels are those of the textures in `folder`: pairs of a texture's name and a channel's number."""
+    """Write a PNG that takes each of its channels from a texture in `folder`.
+
+    `channels` has a pair for each channel: the texture's name without suffix, and the index of the texture's channel. If the name begins
+    with "-", the values are inverted (1 − value).
+    """
     import numpy as np  # Debian's Blender may lack it
 
     found = []

@@ -13,16 +13,16 @@ Box = tuple[Vector, Vector]  # lowest and highest corner, in world space
 
 
 def extent(splats: bpy.types.Object, meshes: list[bpy.types.Object]) -> Box:
-    """Return the box around a run that was not moved after its import: around its mesh, or around most of its splats if it has no mesh."""
+    """Return the box around the mesh of a run that was not moved after its import. Without a mesh, the box is around most of its splats."""
     solid = [item for item in meshes if item.data.polygons]
     return _box(solid) if solid else bounds(splats.data)
 
 
 def put_beside(collection: bpy.types.Collection, layer: bpy.types.ViewLayer) -> bpy.types.Object | None:
-    """Move a run that was just imported out of other visible objects, such as Blender's default cube, along x.
+    """Move an imported run along x until it overlaps no other visible mesh object, such as Blender's default cube.
 
-    Returns the object that the run stands beside now, or None if it was not moved. An object with at least LARGE times the run's longest
-    side counts as a room: the run may stand in it.
+    Call this right after the import. Returns the object that the run now stands beside, or None if the run was not moved. An object with at
+    least LARGE times the run's longest side counts as a room: the run may stand in it.
     """
     layer.update()
     low, high = extent(parts(collection)["splats"][0], parts(collection).get("mesh", []))

@@ -60,17 +60,18 @@ def crop(splats: bpy.types.Object, collection: bpy.types.Collection, on: bool) -
 
 
 def training_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Find the box that limits the training. Returns None if none was chosen or the box was deleted."""
+    """Find the training box, which limits what is trained. Returns None if none was chosen or the box was deleted."""
     box = scene.refgs.region
     return box if box is not None and scene in box.users_scene else None
 
 
 def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Show the box that limits the training: only what is inside is trained. Make the box if there is none.
+    """Show the training box, which limits the training: only what is inside is trained. Make the box if there is none.
 
-    The check of a capture finds the sphere that the cameras look at. A new box encloses this sphere. If the capture was not checked, the
-    new box is 2 m wide around the origin. That is right for most captures: the trainer turns, moves and scales the cameras so that the
-    sphere has its centre at the origin and a radius of 1 m. Captures from NeRF-Blender usually keep their cameras unchanged.
+    A box that was only guessed from the cameras counts as placed by the artist from now on. The check of a capture finds the sphere that
+    the cameras look at. A new box encloses this sphere. If the capture was not checked, the new box is 2 m wide around the origin. That is
+    right for most captures: the trainer turns, moves and scales the cameras so that the sphere has its centre at the origin and a radius of
+    1 m. Captures from NeRF-Blender usually keep their cameras unchanged.
     """
     box = training_region(scene)
     if box is None:
@@ -84,10 +85,10 @@ def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def show_guessed_region(scene: bpy.types.Scene, centre: list[float], radius: float) -> None:
-    """Add the box in which masks will look for the object, unless the scene has a training box.
+    """Add a guessed training box around the sphere that the cameras look at, unless the scene has a training box.
 
-    It limits no training until the artist changes it, or presses Add Region. The cameras look at the sphere with this `centre` and
-    `radius`.
+    The trainer will look for the object in this box when it makes masks. The box limits no training until the artist changes it, or presses
+    Add Region. `centre` and `radius` are those of the sphere.
     """
     if training_region(scene) is None:
         box = _new_training_region(scene)
@@ -107,10 +108,10 @@ def _is_guess(scene: bpy.types.Scene, box: bpy.types.Object) -> bool:
 
 
 def show_found_region(scene: bpy.types.Scene, settings: list[str]) -> bpy.types.Object:
-    """Move the training box to where the masks found the object, with some room around it. Make the box if there is none.
+    """Move the training box to where the trainer found the object when it made masks. Make the box if there is none.
 
-    `settings` are settings of the trainer, such as "region.size=[1, 1, 2]". The box counts as found by the program (`artists_region`) until
-    the artist changes it.
+    The box is a little larger than the object. `settings` are settings of the trainer, such as "region.size=[1, 1, 2]". Until the artist
+    changes the box, `artists_region` does not return it.
     """
     values = {key: json.loads(value) for key, value in (word.split("=", 1) for word in settings)}
     box = training_region(scene) or _new_training_region(scene)
@@ -124,7 +125,7 @@ def show_found_region(scene: bpy.types.Scene, settings: list[str]) -> bpy.types.
 
 
 def artists_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Find the training box if an artist made, moved or scaled it. Returns None if there is no box, or if only the program placed it."""
+    """Find the training box if an artist made or changed it. Returns None if there is no box, or if only the program placed it."""
     box = training_region(scene)
     if box is None or FOUND not in box:
         return box
@@ -142,7 +143,7 @@ def _new_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def _world_matrix(scene: bpy.types.Scene, box: bpy.types.Object) -> Matrix:
-    """Return an object's present matrix, even if it was moved or hidden just before."""
+    """Return an object's present matrix from local to world coordinates, even if it was moved or hidden just before."""
     hidden, box.hide_viewport = box.hide_viewport, False  # Blender does not evaluate hidden objects
     for layer in scene.view_layers:
         layer.update()
@@ -163,7 +164,9 @@ def _looked_at(scene: bpy.types.Scene) -> tuple[Vector, float]:
 def region_settings(scene: bpy.types.Scene) -> dict[str, list[float]]:
     """Return the trainer's settings for the scene's training box. Return {} if there is no box, or only a guessed one.
 
-    Only what is inside the box is trained, and its Z axis becomes the result's up direction. Raises InputError if the box has no volume.
+    The settings are region.centre, region.size (the lengths of its sides), region.rotation (XYZ Euler angles in degrees) and region.up (the
+    box's Z axis as a unit vector). Only what is inside the box is trained, and region.up becomes the result's up direction. Raises
+    InputError if the box has no volume.
     """
     box = training_region(scene)
     if box is None or _is_guess(scene, box):

@@ -34,8 +34,8 @@ def render_preview(
 
     `size` is the picture's longer side in pixels; by default the picture is as large as the camera's photo. `samples` are Eevee's. `png`
     gets 8-bit sRGB with straight alpha, through the Standard view transform. `exr` gets linear Rec.709 radiance in 32 bits, premultiplied.
-    With an OpenColorIO config that lacks these, `png` is made by the scene's own view, and `exr` has the config's working space. The
-    scene's own settings are restored. Raises InputError where there is no camera or a file cannot be written.
+    If the OpenColorIO config has no Standard view, `png` is made by the scene's own view. If it has no Rec.709, `exr` has the config's
+    working space. The scene's own settings are restored. Raises InputError if there is no camera or a file cannot be written.
     """
     camera = camera or scene.camera
     if camera is None:

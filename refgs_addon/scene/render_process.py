@@ -38,7 +38,8 @@ def render_in_background(
 def start_blender(name: str, log: str, command: Mapping[str, object], file: str | None = None) -> jobs.Job:
     """Start a job in another Blender process. That Blender opens `file`, a .blend, if it is given.
 
-    `name` names the job, and `log` names its log file. `command` is what `render_worker` reads.
+    `name` names the job, and `log` names its log file. `command` tells the process what to do; the module `render_worker` lists the
+    commands.
     """
     start = _START.format(root=str(ROOT))
     words = ("--factory-startup", "--background", *([file] if file else []), "--python-expr", start)

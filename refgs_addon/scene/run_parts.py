@@ -49,13 +49,16 @@ def shown(collection: bpy.types.Collection) -> str:
 
 
 def stand_with(item: bpy.types.Object, other: bpy.types.Object) -> None:
-    """Put an object where another one is, under the same parent, so that they move together."""
+    """Give the object `item` the parent and local transform of the object `other`. They then stand in one place and move together."""
     item.parent, item.matrix_parent_inverse = other.parent, other.matrix_parent_inverse
     item.matrix_basis = other.matrix_basis
 
 
 def active_run(context: bpy.types.Context) -> bpy.types.Collection | None:
-    """Find the collection of the run to which the active object belongs. If it belongs to none, find the scene's newest run."""
+    """Find the collection of the imported run that contains the active object. If no run does, return the scene's newest run.
+
+    Returns None if the scene has no run.
+    """
     runs = [collection for collection in context.scene.collection.children if parts(collection)]
     chosen = context.view_layer.objects.active
     of_chosen = [run for run in runs if chosen is not None and chosen.name in run.all_objects]

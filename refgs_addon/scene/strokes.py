@@ -39,14 +39,15 @@ def camera_with_photo(context: bpy.types.Context) -> bpy.types.Object | None:
 
 
 def canvases() -> list[bpy.types.Image]:
-    """List the canvases in the open .blend file."""
+    """List the canvases in the open .blend file: images on which the artist paints strokes over a photo."""
     return [image for image in bpy.data.images if STROKES in image]
 
 
 def add_canvas(capture: Path, camera: bpy.types.Object) -> bpy.types.Image:
-    """Make a canvas of a camera's photo, or return the existing one. It shows the strokes and the mask that the photo has already.
+    """Make a canvas of a camera's photo: an image on which the artist paints strokes. If the photo has a canvas already, return that one.
 
-    Raises InputError if the photo is not in the folder `capture`, or if Blender cannot open it.
+    The canvas shows the strokes and the mask that the photo has already. Raises InputError if the photo is not in the folder `capture`, or
+    if Blender cannot open it.
     """
     photo = Path(camera.data[PHOTO])
     capture = masks_root(capture)
@@ -65,7 +66,7 @@ def add_canvas(capture: Path, camera: bpy.types.Object) -> bpy.types.Image:
 
 
 def show_masks(capture: Path) -> None:
-    """Show the present masks on the canvases of a capture. All strokes stay, even unsaved ones."""
+    """Show the present masks on the canvases (images for painting strokes) of a capture. All strokes stay, even unsaved ones."""
     for canvas in canvases():
         if canvas[CAPTURE] == str(masks_root(capture)):
             _draw(canvas, _read_photo(Path(canvas[PHOTO]), *canvas.size), _strokes(canvas))
@@ -91,7 +92,7 @@ def save(capture: Path) -> list[Path]:
 
 
 def masks_root(capture: Path) -> Path:
-    """Return the folder that holds a capture's folders masks and strokes.
+    """Return the folder in which a capture's folders `masks` and `strokes` are.
 
     This is `capture` itself, or the folder above it if `capture` is a folder of reduced photos, such as images_4.
     """
@@ -100,7 +101,11 @@ def masks_root(capture: Path) -> Path:
 
 
 def _name_in(capture: Path, photo: Path) -> Path:
-    """Return a photo's path relative to the folder of photos. Its strokes have the same relative path in the folder of strokes."""
+    """Return the path of the file with a photo's strokes, relative to the folder `strokes`.
+
+    It is the photo's path in the folder of photos, with the suffix .png. If another photo differs only in its suffix, the photo's own
+    suffix stays: a.jpg.png. Raises InputError if the photo is not in the folder `capture`.
+    """
     try:
         inner = photo.resolve().relative_to(capture.resolve())
     except ValueError:
@@ -123,7 +128,10 @@ def _mask_file(canvas: bpy.types.Image) -> Path | None:
 
 
 def _draw(canvas: bpy.types.Image, picture: "np.ndarray", strokes: "np.ndarray | None") -> None:
-    """Write a canvas's pixels: the photo, red where its mask is black, and the strokes."""
+    """Write a canvas's pixels: the photo, reddened where its mask is black, and the strokes over it.
+
+    `picture` is the photo and `strokes` the strokes, both RGBA (height, width, 4), top row first.
+    """
     import numpy as np
 
     width, height = canvas.size

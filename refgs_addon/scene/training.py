@@ -33,7 +33,8 @@ def check(scene: bpy.types.Scene) -> jobs.Job:
 def find_cameras(scene: bpy.types.Scene) -> jobs.Job:
     """Start a job that computes the cameras from the scene's photos, and then checks the capture.
 
-    Earlier jobs that failed because the photos have no cameras are removed from the list.
+    Earlier jobs that failed because the photos have no cameras are removed from the list of jobs. Raises InputError if there is no trainer
+    or no capture.
     """
     capture = _capture(scene)
     job = jobs.find_cameras(python(), capture, capture_folder(capture), log_file(f"cameras {capture.name}"))
@@ -43,7 +44,7 @@ def find_cameras(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def extract_photos(scene: bpy.types.Scene, video: Path, out: Path | None, count: int) -> jobs.Job:
-    """Start a job that writes up to `count` photos from a video into `out`/images. Then the folder `out` is the scene's capture.
+    """Start a job that writes up to `count` photos from a video into `out`/images. When it is done, `out` becomes the scene's capture.
 
     If `out` is None, it is a new folder beside the video. Raises InputError if there is no trainer or no video, or if `out`/images exists.
     """
@@ -67,9 +68,11 @@ def extract_photos(scene: bpy.types.Scene, video: Path, out: Path | None, count:
 def make_masks(scene: bpy.types.Scene) -> jobs.Job:
     """Start a job that makes masks for the scene's capture, and then checks the capture.
 
-    The trainer looks for the object in the training box, if the artist placed one; otherwise in the middle of what the cameras look at. If
-    a model is chosen in the preferences, the trainer finds the object with it. Masks change the frame of the capture. So when the job is
-    done, the cameras and the box around the object are shown at their new places. Canvases of strokes show the new masks.
+    The trainer looks for the object in the training box if the artist placed one, otherwise in a box around the place that the cameras look
+    at. If a segmentation model is chosen in the preferences, the trainer uses it to find the object. The coordinate frame of a training
+    depends on the masks. So when the job is done, the cameras and the training box are shown at their places in the new frame. The
+    canvases, images on which the artist paints strokes, show the new masks. Raises InputError if there is no trainer or no capture, if the
+    box is flat, or if the capture's masks are being made already.
     """
     capture, mine = _capture(scene), artists_region(scene) is not None
     settings = region_settings(scene) if mine else {}
@@ -91,10 +94,11 @@ def make_masks(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def _show_masks(number: int, capture: Path, found: dict) -> None:
-    """Show masks that were just made: on canvases of strokes, and as the box around the object.
+    """Show masks that the trainer has just made: on the canvases for strokes, and by the training box.
 
-    A box that the artist placed is not replaced. The new masks may move the capture's frame; the box is then moved along. `found` is the
-    trainer's result of making masks. `number` is the scene's `session_uid`.
+    The coordinate frame of a training depends on the masks. A box that the artist placed moves with the frame, so that it stays around the
+    object. Otherwise the box moves to where the trainer found the object. `found` is the trainer's result: `region` has the settings of the
+    new box, and `moved` the matrix from the earlier frame to the new one. `number` is the scene's `session_uid`.
     """
     strokes.show_masks(capture)
     if known := _scene(number):
@@ -116,10 +120,11 @@ def save_strokes(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def train_other_way(scene: bpy.types.Scene, folder: Path, need: str) -> jobs.Job:
-    """Start a job that trains as `train` does, but reverses one decision of the run in `folder`: whether the scene needs `need`.
+    """Start a job that trains like `train`, but with the opposite of one decision that the run in `folder` made.
 
-    The result goes into a new folder beside that run. If the scene's settings have a property for this need, it gets the reversed answer.
-    Raises InputError as `train` does, and if the run's capture is not the scene's.
+    The decision was about the optional part `need` of the training: kept or left out (see `decisions`). The result goes into a new folder
+    beside that run. If the scene's settings have a property for this part, it is set to the new answer. Raises InputError as `train` does,
+    if the run has no such decision, or if it was trained on another capture than the scene's.
     """
     decision, settings, trained = find_decision(folder, need), scene.refgs, _trained_capture(scene, folder)
     if trained is not None and trained.resolve() != _capture(scene).resolve():
@@ -135,11 +140,11 @@ def train_other_way(scene: bpy.types.Scene, folder: Path, need: str) -> jobs.Job
 def train_with_hint(
     scene: bpy.types.Scene, collection: bpy.types.Collection, kind: str, ray: tuple[Vector, Vector] | None = None
 ) -> jobs.Job:
-    """Start a job that repeats most of a run's training, with a part of the run held as metal or as paint. `kind` is "metal" or "paint".
+    """Start a job that repeats most of a run's training, and keeps a part of the surface metal or paint. `kind` is "metal" or "paint".
 
-    The part is the one that the artist has chosen (`hints.chosen_part`), else the one that a `ray` hits: its origin and its direction, in
-    world space. The result goes into a new folder beside the run. Raises InputError if there is no trainer or no part, or if the run's
-    folder has no checkpoint or its capture is missing.
+    The part is what the artist has chosen (`hints.chosen_part`). If nothing is chosen, it is the part that `ray` hits, a pair of origin and
+    direction in world space. The result goes into a new folder beside the run. Raises InputError if there is no trainer or no part, or if
+    the run's folder has no checkpoint or its capture is missing.
     """
     from .edit import splats_of
     from .export_run import run_folder
@@ -277,7 +282,7 @@ def _remember(scene: bpy.types.Scene, run: Path, capture: Path | None = None) ->
 
 
 def _trained_capture(scene: bpy.types.Scene, run: Path) -> Path | None:
-    """Return the capture that a run was trained on, from the scene's list or from the run itself. Return None if neither names it."""
+    """Return the capture that a run was trained on, from the scene's list or from run.toml. Return None if neither names it."""
     known = next((known.capture for known in scene.refgs.runs if Path(known.folder) == run), "")
     return Path(known) if known else capture_of(run)
 

@@ -14,7 +14,7 @@ LIGHT = "refgs_light"  # custom property of the node group that corrects diffuse
 
 
 def hdris(folder: Path | None = None) -> list[Path]:
-    """List the files of the panoramas that come with Blender, and of those in `folder`."""
+    """List the panorama files (EXR or HDR) that come with Blender, then those in `folder`."""
     own = bpy.utils.system_resource("DATAFILES", path="studiolights/world")
     folders = [Path(path) for path in (own, folder) if path]
     files = [file for path in folders if path.is_dir() for file in sorted(path.iterdir())]
@@ -83,9 +83,9 @@ def match_light(scene: bpy.types.Scene) -> None:
 
 
 def correct_diffuse(scene: bpy.types.Scene) -> None:
-    """Correct the diffuse light of imported runs in Eevee after the scene's world has changed.
+    """Update the node group that corrects Eevee's diffuse light on imported runs. Call this after the scene's world has changed.
 
-    If RefGS did not make the world, nothing is corrected.
+    If RefGS did not make the world, the group corrects nothing. See `nodes.world_diffuse`.
     """
     tree = bpy.data.node_groups.get(NAME)
     if tree is None:

@@ -24,9 +24,10 @@ _NEIGHBOURS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, 
 def bake(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress = lambda done, total: None) -> Textures:
     """Bake the textures of a mesh, `size` texels on each side, from the splats around it.
 
-    Each texel has a point on the mesh. At this point, `composite` computes base colour, metallic, roughness and normal. If the splats have
-    doubt, it also computes doubt. `openness` computes occlusion. A texel just outside a chart (a connected piece of the uv layout) has a
-    point on the plane of the nearest face. `progress` is called with the number of points done and their total.
+    `refgs.render.composite` blends the splats at each texel's point on the mesh. This gives base colour, metallic, roughness and normal,
+    and doubt (0..1: how little the photos tell metal from paint) if the splats have it. `openness` gives occlusion. A texel just outside a
+    chart (a connected piece of the uv layout) has a point on the plane of the nearest face. `progress` is called with the number of points
+    done and their total.
     """
     coarse = _composited(mesh, splats, size, progress)
     tangents, signs = vertex_tangents(mesh)
@@ -53,7 +54,7 @@ def bake(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress = la
 
 
 def _composited(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:
-    """Composite the splats at each texel of a texture with C × C texels. Returns the K values of `composite` for each: (C, C, K).
+    """Blend the splats at each texel of a texture with C × C texels. Returns the K values of `refgs.render.composite`: (C, C, K).
 
     C is at most `size`. It is smaller if the splats are large, so that a texel is not much finer than 1/FINE of a splat's standard
     deviation.
@@ -97,7 +98,10 @@ def _enlarged_rows(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
 
 
 def _pad(maps: list[np.ndarray], mask: np.ndarray) -> None:
-    """Fill each texel outside the mask with the values of the nearest texel inside it."""
+    """Fill each texel outside the mask (S, S) with the values of the nearest texel inside it.
+
+    Changes `maps` in place: arrays (S, S) or (S, S, C).
+    """
     nearest = cast(np.ndarray, distance_transform_edt(~mask, return_distances=False, return_indices=True))
     for rows in _row_blocks(len(mask)):
         for values in maps:
@@ -111,8 +115,9 @@ def _interpolate(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
 def _in_tangent_space(vectors: np.ndarray, *basis: np.ndarray) -> np.ndarray:
     """Convert vectors (N, 3) to tangent space. `basis` is three arrays (N, 3): tangents, bitangents and normals. Returns unit vectors.
 
-    A shader adds x·tangent + y·bitangent + z·normal. Its three interpolated vectors are neither orthogonal nor of unit length. So x, y and
-    z are found by solving a linear system. Dot products would be wrong.
+    A shader converts a vector (x, y, z) back by x·tangent + y·bitangent + z·normal. These three vectors are interpolated, so they are
+    neither orthogonal nor of unit length. Dot products with them would be wrong: x, y and z are the solution of a linear system. z is at
+    least 0.05 before normalization.
     """
     a, b, c = basis
     across = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)

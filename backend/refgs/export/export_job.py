@@ -39,8 +39,8 @@ def export(
     - texture: the side of the textures in texels; None means the side in the run's settings
     - splats_file: a .ply file for the splats with their materials
     - display_file: a .ply file for splats without materials, for viewers that compute no lighting
-    - overwrite: replace files that exist. Without it, InputError is raised.
-    - report: a function that is told each step, the progress and warnings
+    - overwrite: replace files that exist. If it is false and a file exists, InputError is raised.
+    - report: a function that is called with each step, the progress and warnings
     """
     splats = [file for file in (splats_file, display_file) if file is not None]
     is_run = folder.is_dir() or folder.suffix.lower() != ".ply"

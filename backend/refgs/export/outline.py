@@ -30,10 +30,11 @@ def fit_to_outlines(
 ) -> SmoothMesh:
     """Move a mesh's vertices along their normals until its outlines match the object's outlines in renderings.
 
-    `render` makes the rendering for a camera. First all vertices move by the same distance, the median gap between the two outlines. Then
-    vertices on the mesh's outlines move by the gap at their place. Vertices outside the object's outline move back inside. No vertex moves
-    by more than LARGEST_MOVE times `voxel`. `voxel` is the size in world units of the voxels that the mesh was made from. The mesh is
-    returned unchanged if the renderings show no background around the object.
+    `render` makes the rendering for a camera; at most VIEWS of the cameras are used. First all vertices move outwards by the same distance,
+    the median gap between the two outlines. Then vertices on the mesh's outlines move by the gap at their place. Vertices outside the
+    object's outline move back inside. No vertex moves by more than LARGEST_MOVE times `voxel`. `voxel` is the size in world units of the
+    voxels that the mesh was made from. The mesh is returned unchanged if the renderings show no background around the object, or if most
+    gaps are larger than LARGEST_MOVE + 1 voxels.
     """
     chosen = [cameras[i] for i in np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).astype(int)]
     views = [(camera, _signed_distance(render(camera).alpha.numpy())) for camera in chosen]
@@ -63,7 +64,7 @@ def fit_to_outlines(
 
 
 def _overshoot(vertices: np.ndarray, views: list[tuple[Camera, np.ndarray]]) -> np.ndarray:
-    """Measure how far vertices lie outside the object's outlines, in world units (V,). The largest distance over the views counts.
+    """Measure how far vertices (V, 3) lie outside the object's outlines, in world units (V,). Of all views, the largest distance counts.
 
     `views` are pairs of a camera and the result of `_signed_distance` for its rendering.
     """
@@ -105,7 +106,7 @@ def _signed_distance(alpha: np.ndarray) -> np.ndarray:
 
 
 def _look_up(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Look up values in a `picture` that was enlarged UPSAMPLING times, at positions `x` and `y` in pixels of the original picture."""
+    """Read values of a picture that was enlarged UPSAMPLING times. `x` and `y` are positions in pixels of the original picture."""
     row, column = ((UPSAMPLING * v).astype(int) for v in (y, x))
     return picture[row.clip(0, len(picture) - 1), column.clip(0, picture.shape[1] - 1)]
 

@@ -68,7 +68,7 @@ def _parts(mesh: Mesh) -> list[np.ndarray]:
 
 
 def layout(mesh: UnwrappedMesh) -> Layout:
-    """Measure how good the uv layout of a mesh is."""
+    """Measure how good the uv layout of a mesh is, by the figures of `Layout`."""
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]

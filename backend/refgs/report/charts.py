@@ -59,7 +59,7 @@ def _color(index: int) -> tuple[float, ...]:
 
 
 def error_chart(groups: list[list[Curve]], runs: list[str]) -> str:
-    """Draw a chart for each error measure, such as PSNR: error over seconds of training. Both axes are logarithmic.
+    """Draw a chart for each error measure, such as FLIP: error over seconds of training. Both axes are logarithmic.
 
     `groups` has a list of curves for each measure. `runs` are the labels of all runs; a run has the same colour in all charts. Returns SVG,
     or "" if `groups` is empty.

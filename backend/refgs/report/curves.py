@@ -17,9 +17,9 @@ LEAST_KNEE = 0.1  # of the chord's height; a curve that bends less has no knee
 
 
 class Quantity(NamedTuple):
-    """Name an error measure of history.jsonl: its key in the file, its title, and its unit. Smaller errors are better.
+    """Describe an error measure of history.jsonl by its key in the file and its title. Smaller errors are better.
 
-    With `decibels`, the file has a PSNR in dB. `error` converts it to an RMS error, for pixel values in 0..1.
+    `decibels` tells that the file has a PSNR in dB. `error` converts it to an RMS error, for pixel values in 0..1.
     """
 
     key: str
@@ -50,7 +50,7 @@ QUANTITIES = (
 
 
 class Curve(NamedTuple):
-    """Hold the errors of one run, by one error measure, and when they were measured. The arrays are (n,), sorted by time."""
+    """Hold the errors (n,) of one run, by one error measure, and the iterations and seconds at which they were measured. Sorted by time."""
 
     run: str
     quantity: Quantity
@@ -78,10 +78,10 @@ def _iteration(line: dict) -> float:
 
 
 def front(curves: list[Curve]) -> list[np.ndarray]:
-    """Find the Pareto front of all curves: a mask (n,) for each curve that selects its points on the front.
+    """Find the points of all curves that are on the common Pareto front. Returns a mask (n,) for each curve.
 
-    A point is on the front if no other point beats it. To beat it takes a smaller error in at most the same time, or at most the same error
-    in less time.
+    A point is on the front if no other point beats it. A point beats another by a smaller error in at most the same time, or by at most the
+    same error in less time.
     """
     seconds, errors = (np.concatenate([getattr(c, name) for c in curves]) for name in ("seconds", "errors"))
     order = np.lexsort((errors, seconds))
@@ -124,10 +124,10 @@ def time_to(curve: Curve, error: float) -> float | None:
 
 
 def levels(curves: list[Curve]) -> list[float]:
-    """Choose about LEVELS error values between the worst and the best error of the curves. Return them with the largest error first.
+    """Choose about LEVELS error values for which the report says when each curve reaches them. Return them with the largest error first.
 
-    The values are round numbers. If the errors come from a PSNR, the values are round in decibels instead. The report says when each
-    curve reaches each value.
+    They lie between the largest first error and the smallest error of the curves. They are round numbers; if the errors come from a PSNR,
+    they are round in decibels instead.
     """
     quantity = curves[0].quantity
     worst, best = max(c.errors[0] for c in curves), min(c.errors.min() for c in curves)
@@ -142,9 +142,9 @@ def levels(curves: list[Curve]) -> list[float]:
 def as_csv(histories: dict[str, list[dict]], groups: list[list[Curve]]) -> str:
     """Write the numbers behind the report's charts as CSV. The columns are run, iteration, seconds, quantity, value, mark.
 
-    - Each point of a curve has a row. Its mark is "front" on the Pareto front, "knee" at the knee, both, or empty.
-    - A row with the mark "reaches" has the seconds after which a curve reaches a given error.
-    - A row with the quantity "part: NAME" has as value the seconds spent on this kind of work, such as shading.
+    - A row for each point of a curve: its mark is "front" on the Pareto front, "knee" at the knee, both, or empty.
+    - A row with the mark "reaches": `seconds` is the time after which the curve first reaches the error `value`.
+    - A row with the quantity "part: NAME": `value` is the seconds spent on this kind of work, such as shading.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

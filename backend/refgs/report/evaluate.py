@@ -40,11 +40,11 @@ def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None,
     """Compare a run with the photos of `views`, and with ground truth if it is given. Returns the metrics for metrics.json, such as PSNR.
 
     If the ground truth is of a published data set, the run is also measured by that data set's protocol (`refgs.report.published`). In this
-    case, the views under other lights are those that the protocol asks for, and no others.
+    case, the run is rendered only under the other lights that the protocol names.
 
-    Writes pictures to folders in the run's folder: the views to pictures/`split`, the light to pictures, and views under other lights to
-    pictures/relight. `split` is "test" for held-out views. After each rendering, `step` is called with the number of renderings that are
-    done, a note, and their total number.
+    Writes pictures into the run's folder: of the views to pictures/`split`, of the light to pictures, and of the run under other lights to
+    pictures/relight. `split` is "test" for held-out views, "train" for training views. After each rendering, `step` is called with the
+    number of renderings that are done, a note, and their total number.
     """
     pictures, lit = run.folder / "pictures", run.environment is not None
     by_protocol = published.steps(truth, len(views)) if lit else 0  # how often the data set's protocol renders
@@ -90,7 +90,10 @@ def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None,
 def _measure_view(
     run: Run, view: View, loaded: LoadedView, truth: GroundTruth | None, pictures: Path, with_lpips: bool
 ) -> dict[str, Any]:
-    """Render one view, compare it with its photo and with the true maps, and write all of these as pictures. Returns the metrics."""
+    """Render one view, and compare it with its photo and with the true maps, such as normals. Returns the metrics.
+
+    Writes the photo, the rendering and all maps, rendered and true ones, as pictures into the folder `pictures`.
+    """
     camera, background = loaded.camera, np.array(run.settings.image.background, dtype=np.float32)
     rendering = run.render(camera)
     color = np.clip(rendering.color.numpy(), 0, 1)
@@ -132,7 +135,10 @@ def _measure_view(
 
 
 def _doubt(run: Run, camera: Camera) -> np.ndarray:
-    """Render the doubt of the splats' metallic (H, W), 0..1, as a camera sees it. The splats must have that value."""
+    """Render the splats' doubt (0..1: how little the photos tell metal from paint) as a camera sees it. Returns (H, W).
+
+    The splats must have this value.
+    """
     feature = torch.from_numpy(run.splats.doubt)[:, None]
     drawn = rasterize(*discs(run.surfels(), camera), feature, camera, near=run.near)
     return (drawn.features[..., 0] / drawn.alpha.clamp_min(COVERED)).numpy()
@@ -141,7 +147,8 @@ def _doubt(run: Run, camera: Camera) -> np.ndarray:
 def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dict[str, float]]:
     """Compare the recovered light with the true light, and write both as pictures. Returns the metrics.
 
-    If the true light is unknown, or if the recovered light turns with the camera, there are no metrics: {}.
+    If the true light is unknown, or if the recovered light turns with the camera, there is only a picture of the recovered light, and the
+    result is {}.
     """
 
     def write(name: str, panorama: np.ndarray) -> None:
@@ -167,8 +174,8 @@ def _measure_relit(
 ) -> dict[str, float]:
     """Render the views under another light and compare them with ground truth. Returns the metrics.
 
-    Writes the renderings and the ground truth as pictures. `hdri` names the light in the folder of ground truth. `next_step` is called with
-    a note after each view.
+    Writes the renderings and the true pictures into the folder `pictures`. `hdri` is the light's name in the ground truth. `next_step` is
+    called with a note after each rendering. Each view is rendered twice.
     """
     light = run.light(truth.panorama(f"relight/{hdri}"))
 
@@ -187,7 +194,7 @@ def _measure_relit(
 def _measure_speed(run: Run, cameras: list[Camera]) -> dict[str, float | str]:
     """Measure how fast the renderer is. It runs on a CUDA card if one can be used, else on the CPU.
 
-    Returns two metrics: `frames_per_second`, by the median time of a frame, and `frames_device`, the card's name or "cpu".
+    Returns two metrics. `frames_per_second` is 1 / the median time of a frame. `frames_device` is the card's name or "cpu".
     """
     device = torch.device("cuda" if cuda.unusable() is None else "cpu")
     surfels = Surfels(*(value.to(device) for value in run.surfels()))

@@ -15,8 +15,8 @@ RELIT = {
 class Quantity(NamedTuple):
     """Describe a metric of metrics.json.
 
-    `key` joins nested keys by dots, such as "mesh.chamfer". `heading` is its title in tables. `text` formats its value. `better` is the
-    function max or min, whichever picks the better value, or None if neither is better.
+    `key` joins nested keys by dots, such as "mesh.chamfer". `heading` is its title in tables. `text` formats its value. `better` is `max`
+    if larger values are better, `min` if smaller ones are, or None if neither is.
     """
 
     key: str
@@ -85,7 +85,7 @@ def flatten(values: object, prefix: str = "") -> Iterator[tuple[str, float]]:
 
 
 def in_words(metrics: dict, figures: list[Quantity]) -> list[str]:
-    """Format those metrics that `figures` lists as text, such as "PSNR 24.31 dB". Skip those that `metrics` lacks."""
+    """Format the metrics that `figures` describes as text, such as "PSNR 24.31 dB". Skip those that `metrics` lacks."""
     known = dict(flatten(metrics))
     return [f"{heading} {text(known[key])}" for key, heading, text, _ in figures if key in known]
 
@@ -93,9 +93,9 @@ def in_words(metrics: dict, figures: list[Quantity]) -> list[str]:
 def relit_pair(figures: dict[str, float], prefix: str) -> str:
     """Format PSNR and FLIP of pictures under another light as text, such as "24.10 / 26.30 dB, FLIP 0.081 / 0.072".
 
-    The first of two numbers is "raw", the second "aligned": measured after the brightness was multiplied by the factor that fits best.
-    `figures` has the metrics as a flat dict. Its keys are joined by dots, such as "relight.studio.mesh.psnr_raw". `prefix` is the start of
-    the keys to format, such as "relight.studio.mesh".
+    The first number of each pair is "raw". The second is "aligned": measured after the renderings' radiance was multiplied by the factor
+    that fits best. `figures` has the metrics as a flat dict. Its keys are joined by dots, such as "relight.studio.mesh.psnr_raw". `prefix`
+    is the start of the keys to format, such as "relight.studio.mesh".
     """
     parts = []
     for name, text in (("psnr", "{:.2f}"), ("flip", "{:.3f}")):

@@ -22,9 +22,9 @@ BY_NAME = {  # in this order; other settings follow, under their own names
 def labels(names: list[str], facts: list[Summary]) -> list[str]:
     """Make a unique label for each run from the settings in which the runs differ.
 
-    `facts` are what the runs' run.toml say. `names` are their folders' names, which are added where labels are equal or empty. If a
-    setting differs only because the presets differ, the label has the name of the preset instead. Settings are named without their section,
-    unless another section has a setting with the same name.
+    `facts` are the contents of the runs' run.toml. `names` are the names of the run folders; the label ends with the name if it would
+    otherwise be empty or not unique. If a setting differs only because the presets differ, the label has the name of the preset instead.
+    Settings are named without their section, unless another section has a setting with the same name.
     """
     known = [_settings(summary) for summary in facts]
     groups = defaultdict(list)

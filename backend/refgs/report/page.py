@@ -4,7 +4,7 @@ It reads these files of a run folder. If a file is missing, its section is left 
 
     metrics.json     nested objects. Their numbers are metrics: those that `refgs.report.figures` names,
                      relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}, and any others.
-                     Texts are ambiguities.NAME.what and doubt.what: messages on what photos do not tell.
+                     Texts are ambiguities.NAME.what and doubt.what: sentences on what photos cannot tell apart.
     history.jsonl    one object a line: seconds, iteration, parts (seconds by kind of work), and the errors that `refgs.report.curves` names
     needs.json       optional features that were kept or left out: a list of {"what", "why"}, with "saved", "cost", "needed" if known, and
                      "pictures" with and without the feature, in needs/
@@ -57,7 +57,7 @@ LARGEST_SIDE = 512  # pixels, so that the page stays small enough to open
 
 @dataclass
 class RunPage:
-    """Hold what the report page shows of one run. If it shows several runs, `label` tells them apart."""
+    """Hold what the report page shows of one run. On a page about several runs, `label` is the run's unique name."""
 
     name: str
     label: str
@@ -114,7 +114,7 @@ def write_report(runs: list[Path], out: Path) -> None:
 
 
 def template(file: Path) -> jinja2.Template:
-    """Load a page's template. It may include files that lie beside it, and those of the report, such as style.html."""
+    """Load a page's HTML template for Jinja. It may include files from its own folder and from the report's, such as style.html."""
     folders = [file.parent, Path(__file__).parent]
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(folders), autoescape=True, trim_blocks=True, lstrip_blocks=True
@@ -171,7 +171,7 @@ def _read_run(folder: Path) -> RunPage:
 
 
 def _settings(file: Path) -> tuple[str, Summary]:
-    """Read run.toml: its text, and what it says of the run. Raises InputError if it cannot be read."""
+    """Read a run.toml. Returns the file's text, and its parsed content. Raises InputError if it cannot be read."""
     again = "Copy the run folder again."
     text = read_text(file, again)
     return text, validated(parse_toml(text, str(file), again), Summary, str(file), again)
@@ -182,7 +182,11 @@ def _needs(file: Path) -> Needs:
 
 
 def _decisions(folder: Path, rows: list[Row]) -> list[dict]:
-    """Make a dict of each row of needs.json: its decision, a line with PSNRs, and pictures as data URLs. Skip rows without pictures."""
+    """Describe for the page which optional parts of the training a run kept or left out. `rows` are those of needs.json.
+
+    Returns a dict for each row: the decision in words, a line with PSNRs, and pictures with and without the part as data URLs. Skips rows
+    without pictures.
+    """
     found = []
     for row in rows:
         if (shown := row.pictures) is None:
@@ -213,10 +217,10 @@ def _history(folder: Path, missing: list[str]) -> list[dict]:
 
 
 def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[str, str]]:
-    """Read the pictures folder/KIND/NAME.png as data URLs: {name: {kind: data URL}}.
+    """Read the pictures folder/KIND/NAME.png as data URLs: {name: {kind: data URL}}. The keys of `kinds` are the kinds to read.
 
-    Names with fewer kinds than other names are skipped. If more than `most` are left, only `most` of them are
-    read, evenly spaced in alphabetical order.
+    Names with fewer kinds than other names are skipped. If more than `most` names are left, only `most` of them are read, evenly spaced in
+    alphabetical order.
     """
     count = Counter(path.stem for kind in kinds for path in folder.glob(f"{kind}/*.png"))
     names = sorted(name for name in count if count[name] == max(count.values()))

@@ -21,7 +21,7 @@ RATIO_VIEWS = 20  # by which TensoIR corrects base colour, evenly chosen; pictur
 
 
 def steps(truth: GroundTruth | None, views: int) -> int:
-    """Return how often `measure` renders for a number of test views."""
+    """Return how many renderings `measure` makes of a run with this number of test `views`."""
     if isinstance(truth, TensoIRTruth):
         ratio = min(views, RATIO_VIEWS) if "albedo" in truth.passes else 0
         return ratio + (views if truth.passes else 0) + views * len(truth.hdris)
@@ -33,7 +33,7 @@ def measure(
 ) -> dict[str, Any]:
     """Measure a run's test views by the protocol of its data set. Returns {"tensoir": …} or {"stanford_orb": …}, {} for other captures.
 
-    Writes the views under other lights, and their true pictures, into the folder `pictures`. `next_step` is called with a note after each
+    Writes renderings under other lights, and the true pictures, into the folder `pictures`. `next_step` is called with a note after each
     rendering. The run must have materials and a light.
     """
     if isinstance(truth, TensoIRTruth):
@@ -49,7 +49,8 @@ def _tensoir(
 ) -> dict[str, Any]:
     """Measure as TensoIR does: normals and base colour over whole pictures, and pictures under other lights.
 
-    If the true base colours are known, the run's are first corrected by one factor for each channel, the result's `ratio`.
+    If the true base colours are known, the run's base colours are first multiplied by one factor for each channel. The result has these
+    factors as `ratio`.
     """
     found: dict[str, Any] = {}
     places = np.linspace(0, len(cameras) - 1, min(len(cameras), RATIO_VIEWS)).round().astype(int)
@@ -95,9 +96,10 @@ def _relit_as_tensoir(
     pictures: Path,
     next_step: Callable[[str], None],
 ) -> dict[str, float]:
-    """Measure the views of `cameras` under another light. Returns the mean "psnr" and "ssim". Writes pictures of the `chosen` cameras.
+    """Compare renderings of `cameras` under another light with true pictures. Returns the mean "psnr" and "ssim".
 
-    Pictures are put over the run's background, which presets make white, in sRGB-encoded colours.
+    Writes pictures of the `chosen` cameras. Pictures are compared over the run's background, which presets make white, in sRGB-encoded
+    colours.
     """
     light, rows = run.light(truth.panorama(f"relight/{hdri}")), []
     background = np.array(run.settings.image.background, np.float32)
@@ -118,8 +120,8 @@ def _stanford_orb(
 ) -> dict[str, Any]:
     """Measure as Stanford-ORB does: the test views, photos of the object in other scenes, normals and depth.
 
-    In the result, `view` holds the metrics of the test views, and `light` those of the other scenes, rendered under those scenes' lights.
-    PSNR-H, the PSNR of linear radiance, is left out for photos that are not EXR files.
+    In the result, `view` holds the metrics of the test views. `light` holds those of the other scenes: the run is rendered under the light
+    of each scene. PSNR-H, the PSNR of linear radiance, is left out for photos that are not EXR files.
     """
     with_lpips, found = metrics.lpips_missing() is None, {}
     rows: dict[str, dict[str, list[float]]] = {"view": {}, "light": {}}
@@ -163,13 +165,13 @@ def _stanford_orb(
 
 
 def _mask(loaded: LoadedView) -> np.ndarray:
-    """Return the photo's mask (h, w) in 0..1, 1 everywhere if it has none."""
+    """Return the photo's mask (h, w) in 0..1. It is 1 everywhere if the photo has no mask."""
     shape = loaded.image.shape[:2]
     return np.ones(shape) if loaded.alpha is None else loaded.alpha / 255
 
 
 def _radiance(run: Run, rendering: Rendering) -> np.ndarray:
-    """Convert a rendering's picture to linear radiance over black, float32 (h, w, 3). The picture has the run's background."""
+    """Convert a rendering's picture, which lies over the run's background, to linear radiance over black: float32 (h, w, 3)."""
     alpha = rendering.alpha.numpy()[..., None]
     over = rendering.color.numpy() - np.array(run.settings.image.background, np.float32) * (1 - alpha)
     return srgb_decode(np.maximum(over, 0))
