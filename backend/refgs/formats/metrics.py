@@ -13,15 +13,16 @@ class _Figures(RootModel[dict[str, JsonValue]]):
 
 
 class Said(Model):
-    """Hold `what`, a sentence for the user about a measurement. It is None if there is nothing to tell."""
+    """Hold `what`, a sentence that tells the user about a measurement, or None if there is nothing to tell."""
 
     what: str | None = None
 
 
 class Metrics(Model):
-    """Hold the texts in metrics.json, which say what photos cannot tell apart.
+    """Hold the sentences in metrics.json about what photos cannot tell apart.
 
-    `ambiguities` are changes of light and materials that cancel in all pictures. `doubt` is about surfaces that may be metal or paint.
+    - `ambiguities`: changes of light or materials that another change can hide in all pictures, by the change's name
+    - `doubt`: surfaces that may be metal or paint
     """
 
     ambiguities: dict[str, Said] = Field(default_factory=dict)
