@@ -134,7 +134,7 @@ class _Reader:
         self._file.seek(count, 1)
 
     def rows(self, kind: str) -> Iterator[int]:
-        """Read the number of rows, then yield the identifier of each row. `kind` is its format for `struct`, such as "I".
+        """Read the number of rows, then yield the identifier of each row. `kind` is the identifier's format as in `struct`, such as "I".
 
         The caller must read the other values of a row before it asks for the next identifier. Raises ValueError if two consecutive rows
         have the same identifier. This finds files with a hole, because a hole reads as zeros.
@@ -235,9 +235,9 @@ def _text_images(file: Path) -> list[Image]:
 
 
 def _is_image(line: str) -> bool:
-    """Return True for the line of an image, False for the line of its keypoints. Some programs leave the keypoints' line out.
+    """Return True for a line of images.txt that describes an image, False for a line of keypoints, which some programs leave out.
 
-    The line of an image ends in its name. The line of keypoints has triples of numbers. Raises ValueError for a line that is neither.
+    An image's line ends in the image's name. A line of keypoints has triples of numbers. Raises ValueError for a line that is neither.
     """
     values = line.split()
     try:

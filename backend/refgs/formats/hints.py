@@ -1,4 +1,4 @@
-"""Read and write hints: the parts of a run's surface that a user says are metal or paint (docs/run-folder.md)."""
+"""Read and write hints: the parts of a reconstructed surface that a user says are metal or paint (docs/run-folder.md)."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ KINDS = get_args(Kind)
 class Hint(NamedTuple):
     """Hold a user's hint: one part of the surface is of this `kind`, "metal" or "paint".
 
-    `points` (P, 3) are positions on the part, in the run's coordinates. Each point stands for the run's nearest splat.
+    `points` (P, 3) are positions on the part, in the run's coordinates. Each point marks the splat that is nearest to it.
     """
 
     kind: Kind

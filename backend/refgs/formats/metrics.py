@@ -1,4 +1,4 @@
-"""Describe metrics.json: what is measured of a run, as nested objects of numbers and texts (docs/run-folder.md)."""
+"""Describe metrics.json: the figures and sentences that evaluating a run gives, as nested objects (docs/run-folder.md)."""
 
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ class Said(Model):
 class Metrics(Model):
     """Hold the sentences in metrics.json about what photos cannot tell apart.
 
-    - `ambiguities`: changes of light or materials that another change can hide in all pictures, by the change's name
+    - `ambiguities`: for each change of light or materials, by its name: whether another change hides it in all pictures
     - `doubt`: surfaces that may be metal or paint
     """
 

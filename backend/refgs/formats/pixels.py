@@ -81,9 +81,9 @@ def png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
 def check_scans(path: Path, width: int, height: int) -> None:
     """Raise InputError if a JPEG has more than SCANS scans. Even a small file with so many would take minutes to decode.
 
-    Scans are counted by their markers (ITU-T T.81, annex B). A marker is 0xFF and a letter. After most markers comes a segment: its length
-    in two bytes, which includes these two, and its data. In the compressed pixels, 0xFF is followed only by 0 or by the letter of a restart
-    marker. Only the first 8 bytes for each of the `width` × `height` pixels are searched, and LARGEST more.
+    Scans are counted by their markers (ITU-T T.81, annex B). A marker is 0xFF and a code byte. After most markers comes a segment: its
+    length in two bytes, which includes these two, and its data. In the compressed pixels, 0xFF is followed only by 0 or by the code of a
+    restart marker. At most 8 · `width` · `height` + LARGEST bytes of the file are searched.
     """
     with open_file(path) as file:
         data = file.read(min(8 * width * height + LARGEST, LONGEST))

@@ -1,4 +1,4 @@
-"""Read and write PLY files. A header is checked against the file's size before memory is reserved for its rows."""
+"""Read and write PLY files. A file's size is checked against its header before memory is reserved for the rows that the header declares."""
 
 import os
 import re

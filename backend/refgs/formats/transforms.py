@@ -37,7 +37,7 @@ class Intrinsics(Model):
 
     @property
     def lens_keys(self) -> dict[str, Any]:
-        """Return those of the file's other keys that are about the lens, with their values. They are known by name, such as `k1`."""
+        """Return the file's keys that describe the lens but are no fields of this class, such as `k1`, with their values."""
         return {key: value for key, value in (self.model_extra or {}).items() if _of_lens(key)}
 
 

@@ -1,7 +1,7 @@
 """Read JSON and TOML files into validated models.
 
-A file that is wrong raises an InputError of one line: the file, the field, what is wrong with it, and what to do. The last is the argument
-`again`, such as "Train again."
+A file that is wrong raises an InputError of one line: the file, the field, what is wrong with it, and what to do. The caller says what to
+do by the argument `again`, such as "Train again."
 """
 
 import json
@@ -91,7 +91,7 @@ def validated(data: Any, model: type[M], source: str, again: str) -> M:
 
 
 def _place(error: Any, data: Any) -> tuple[list[str], str]:
-    """Return where in `data` pydantic found an error: the camera's frame, and the field's keys joined by dots.
+    """Return where in `data` pydantic found an error: the frame, if any, and the field's keys joined by dots.
 
     A frame is a dict with a `file_path`, as in transforms.json. It is returned as a list of one text, "frame PATH". The list is empty for a
     field outside all frames.

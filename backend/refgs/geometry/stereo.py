@@ -109,7 +109,7 @@ def depth_maps(photos: Sequence[Photo], shape: Shape, unsure: np.ndarray) -> lis
 
     Returns a map for each photo that has at least BEST neighbours. A depth has a weight above 0 only if the neighbours show the photo's
     texture in the same place, and if the depth maps of at least AGREE neighbours agree with it. A mirror shows images of other things
-    behind its surface. Such images seldom agree in a curved mirror, but they do in a flat one.
+    behind its surface. Such images seldom agree in a curved mirror, but they do in a flat one, so its depths may be wrong.
     """
     centre, radius = shape.ball
     reduced = [_reduced(photo, shape) for photo in photos]

@@ -91,7 +91,7 @@ class Method:
     """Describe a method of rendering surfels. The defaults describe RefGS's own method.
 
     - `lit`: false if the method has no materials and no light
-    - `deferred`: true if features are blended first, and pixels are shaded
+    - `deferred`: true if the surfels' features are blended first, and then each pixel is shaded
     - `mirror`: true if reflections are a sharp mirror image of the light
     - `light`: how the values of the light represent radiance
     - `draw`: a function that replaces deferred shading; it takes the arguments of `render`. None keeps deferred shading.

@@ -160,7 +160,7 @@ def blend(surfels: Surfels, normals: np.ndarray, points: np.ndarray, outward: np
 
 
 def relit(transport: Transport, light: Environment, bounces: int = BOUNCES) -> Surfels:
-    """Return the surfels relit by `light`: with new `sh` (diffuse colour) and `indirect` (radiance from the object itself).
+    """Return the surfels relit by `light`: with new `sh_*` (diffuse colour) and `indirect_*` (radiance from the object itself).
 
     `transport` holds the surfels' traced rays. `bounces` counts the reflections between parts of the object. Render the result with the
     setting diffuse = "sh" and with the occluder of `transport`.
