@@ -12,10 +12,11 @@ MOST = 75_000_000  # numbers: normals of a photo of 25 million pixels
 
 
 def read_array(path: Path, again: str) -> np.ndarray:
-    """Read an array from a .npy file, or the first one from a .npz file.
+    """Read an array from a .npy file, or the first array from a .npz file.
 
-    Raises FileNotFoundError if the file is missing. Raises InputError, which ends with `again`, if it is broken, holds pickled objects, or
-    has more than MOST numbers: these are counted before memory is taken for them.
+    Raises FileNotFoundError if the file is missing. Raises InputError if the file is broken, holds pickled objects, or declares an array of
+    more than MOST numbers. This size is read before memory is taken for the array. `again` is advice for the user, such as "Save it
+    again.": it ends the message of the InputError.
     """
     try:
         check_file(path)

@@ -1,4 +1,4 @@
-"""Describe the TOML file of a checkpoint: all that the next iteration depends on, except the tensors."""
+"""Describe the TOML file of a checkpoint. It holds everything that the next iteration depends on, except the tensors."""
 
 from typing import Annotated
 
@@ -12,10 +12,18 @@ Seconds = Annotated[Finite, Field(ge=0)]
 
 
 class Facts(Model):
-    """Hold everything in a checkpoint except its tensors.
+    """Hold everything in a checkpoint except its tensors. Times are in seconds.
 
-    `parts` has the numbers and flags that each `refgs.train.part.Part` remembers, by the part's name. `clock` has the seconds
-    spent on each kind of work, such as shading, by its name.
+    - `iteration`, `total`: the number of iterations done, and the number of iterations in the whole training
+    - `seconds`, `processor_seconds`: the wall time and the CPU time of the iterations
+    - `spent`: the wall time of the whole training from the start of its command, without pauses
+    - `initial`: true while the initial stage lasts, in which each surfel is shaded before blending
+    - `residual`: true once the surfels learn a residual, a colour that material and light do not explain
+    - `decided`: the last line that told the user about a decision, by the decision's topic
+    - `clock`: the time spent on each kind of work, such as shading, by its name
+    - `needs`: the decisions about optional parts of the training, such as inter-reflection, by the part's name
+    - `parts`: the numbers and flags that each `refgs.train.part.Part` remembers, by its name. A `Part` is the memory of one task of the
+      training, such as aligning poses.
     """
 
     iteration: Count

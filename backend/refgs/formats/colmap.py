@@ -84,7 +84,10 @@ def read_images(file: Path) -> list[Image]:
 
 
 def count_images(file: Path) -> int:
-    """Count a COLMAP model's images, as `read_images` would read them. Raises InputError for a broken file."""
+    """Return the number of images in a COLMAP model. Raises InputError for a broken file.
+
+    The header of a binary file states the number, and nothing after the header is checked. The images in a text file are counted.
+    """
     return _parse(file, _binary_count, lambda file: len(_text_images(file)))
 
 
@@ -131,9 +134,10 @@ class _Reader:
         self._file.seek(count, 1)
 
     def rows(self, kind: str) -> Iterator[int]:
-        """Count the rows that the file says it has, and yield the identifier of each, of a `kind` of struct.
+        """Read the number of rows, then yield the identifier of each row. `kind` is the identifier's format as in `struct`, such as "I".
 
-        Raises ValueError for two rows in a row with one identifier. A file with a hole has many: a hole reads as zeros.
+        The caller must read the other values of a row before it asks for the next identifier. Raises ValueError if two consecutive rows
+        have the same identifier. This finds files with a hole, because a hole reads as zeros.
         """
         last = None
         for _ in range(self.take("Q")[0]):
@@ -191,9 +195,9 @@ def _points(numbers: array) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _entries(file: Path, first: Callable[[str], bool] = lambda line: True) -> list[str]:
-    """Return the lines of a COLMAP text file that begin an entry: those for which `first` is true. Comments and empty lines are left out.
+    """Return the lines of a COLMAP text file that begin an entry: those for which the function `first` returns True.
 
-    Raises ValueError if the file has fewer entries than its header says.
+    Comments and empty lines are left out. Raises ValueError if a line is too long, or if the file has fewer entries than its header says.
     """
     entries, counted = [], None
     with open_file(file) as opened:
@@ -231,9 +235,9 @@ def _text_images(file: Path) -> list[Image]:
 
 
 def _is_image(line: str) -> bool:
-    """Return True for the line of an image, False for the line of its keypoints. Some programs leave the keypoints' line out.
+    """Return True for a line of images.txt that describes an image, False for a line of keypoints, which some programs leave out.
 
-    The line of an image ends in its name. The line of keypoints has triples of numbers. Raises ValueError for a line that is neither.
+    An image's line ends in the image's name. A line of keypoints has triples of numbers. Raises ValueError for a line that is neither.
     """
     values = line.split()
     try:

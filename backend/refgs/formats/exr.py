@@ -39,9 +39,10 @@ def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
 
 
 def read_exr_header(path: str | os.PathLike) -> tuple[int, int, bool]:
-    """Read the width, the height, and whether there is alpha, of the part that `read_exr` reads. No pixels are decoded.
+    """Read an EXR file's width, its height, and whether it has alpha. No pixels are decoded.
 
-    Raises InputError if the file is missing or broken, or if its pixels are a crop of the picture or exceed it (overscan).
+    If the file has several parts, the three values are those of the part that `read_exr` reads. Raises InputError if the file is missing or
+    broken, or if its pixels are a crop of the picture or extend beyond it (overscan).
     """
     path = Path(path)
     if not path.is_file():
@@ -70,7 +71,7 @@ def read_exr(path: str | os.PathLike, is_data: bool = False) -> np.ndarray:
     Colours are linear Rec.709: they are converted from the file's chromaticities. With `is_data`, as for normals, they stay as stored.
 
     If the file has several parts, the first part with R, G and B is read. If no part has them, the first part is read. Raises InputError if
-    that part has several channels, or if the file is missing or broken.
+    the file is missing or broken, or if the part has neither R, G and B nor exactly one channel.
     """
     path = Path(path)
     if not path.is_file():
@@ -107,7 +108,10 @@ def read_exr(path: str | os.PathLike, is_data: bool = False) -> np.ndarray:
 
 
 def _as_rec709(path: Path, pixels: np.ndarray, primaries: np.ndarray) -> np.ndarray:
-    """Convert linear pixels (H, W, 3 | 4), in place, from these chromaticities. Colours beyond Rec.709 become negative."""
+    """Convert linear pixels (H, W, 3 | 4) from a file's chromaticities `primaries` to Rec.709, in place.
+
+    Colours beyond Rec.709 get negative components. Raises InputError, which names `path`, if the chromaticities span no colours.
+    """
     if primaries.shape == np.shape(REC709) and np.allclose(primaries, REC709, atol=1e-3):
         return pixels
     try:
@@ -120,7 +124,7 @@ def _as_rec709(path: Path, pixels: np.ndarray, primaries: np.ndarray) -> np.ndar
 
 
 def _check_flat(path: Path, headers: list[dict]) -> None:
-    """Raise InputError if a file is deep: it has a list of numbers a pixel."""
+    """Raise InputError, which names `path`, if a file is deep: each of its pixels has a list of samples."""
     if any(header["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile) for header in headers):
         raise InputError(f"{path} is a deep EXR: save it flattened, with one value a pixel")
 

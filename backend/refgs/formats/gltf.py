@@ -75,9 +75,9 @@ def write_glb(path: str | os.PathLike, mesh: UnwrappedMesh, textures: Textures) 
 
 
 def read_glb(path: str | os.PathLike) -> Mesh:
-    """Read the vertices and faces of a file that `write_glb` wrote. They are turned back to Z up. Raises InputError for a broken file.
+    """Read the vertices and faces of a file that `write_glb` wrote. They are turned back to Z up.
 
-    A file that names other files, as glTF may, is refused.
+    Raises InputError for a broken file, and for a file that refers to other files, as glTF allows.
     """
     try:
         with open_file(path) as file:

@@ -1,4 +1,4 @@
-"""Read and write hints: the parts of a run's surface that a user says are metal or paint (docs/run-folder.md)."""
+"""Read and write hints: the parts of a reconstructed surface that a user says are metal or paint (docs/run-folder.md)."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,10 @@ KINDS = get_args(Kind)
 
 
 class Hint(NamedTuple):
-    """Hold a hint: one part of the surface is of this `kind`. `points` (P, 3) are the part's splats, as positions in the run's frame."""
+    """Hold a user's hint: one part of the surface is of this `kind`, "metal" or "paint".
+
+    `points` (P, 3) are positions on the part, in the run's coordinates. Each point marks the splat that is nearest to it.
+    """
 
     kind: Kind
     points: np.ndarray
@@ -39,6 +42,6 @@ def read_hints(file: Path) -> list[Hint]:
 
 
 def write_hints(file: Path, run: Path, hints: list[Hint]) -> None:
-    """Write hints to a JSON file, with the path of the `run` whose splats they are about."""
+    """Write hints to a JSON file, together with the path of the run folder `run`. The hints mark splats of this run."""
     listed = [{"kind": hint.kind, "points": hint.points.tolist()} for hint in hints]
     write_text(file, json.dumps({"run": str(run.resolve()), "hints": listed}))

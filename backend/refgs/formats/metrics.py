@@ -1,4 +1,4 @@
-"""Describe metrics.json: what is measured of a run, as nested objects of numbers and texts (docs/run-folder.md)."""
+"""Describe metrics.json: the figures and sentences that evaluating a run gives, as nested objects (docs/run-folder.md)."""
 
 from pathlib import Path
 from typing import Any
@@ -13,15 +13,16 @@ class _Figures(RootModel[dict[str, JsonValue]]):
 
 
 class Said(Model):
-    """Hold `what`, a sentence for the user about a measurement. It is None if there is nothing to tell."""
+    """Hold `what`, a sentence that tells the user about a measurement, or None if there is nothing to tell."""
 
     what: str | None = None
 
 
 class Metrics(Model):
-    """Hold the texts in metrics.json, which say what photos cannot tell apart.
+    """Hold the sentences in metrics.json about what photos cannot tell apart.
 
-    `ambiguities` are changes of light and materials that cancel in all pictures. `doubt` is about surfaces that may be metal or paint.
+    - `ambiguities`: for each change of light or materials, by its name: whether another change hides it in all pictures
+    - `doubt`: surfaces that may be metal or paint
     """
 
     ambiguities: dict[str, Said] = Field(default_factory=dict)

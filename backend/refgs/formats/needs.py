@@ -1,4 +1,4 @@
-"""Describe needs.json: the optional parts of a training that a scene needed, and those that were left out (docs/run-folder.md)."""
+"""Describe needs.json: which optional parts of a training, such as inter-reflection, were kept or left out (docs/run-folder.md)."""
 
 from pathlib import PurePosixPath
 from typing import Annotated, Any
@@ -20,9 +20,11 @@ Inside = Annotated[str, AfterValidator(_inside)]
 
 
 class Pictures(Model):
-    """Name three pictures of a view: with an optional part of the training (`on`), without it (`off`), and the photo.
+    """Name the pictures that show what an optional part of the training does in one view, with their PSNR.
 
-    The pictures are files in the run folder. PSNRs are against the photo, in dB.
+    - `on`, `off`, `photo`: files in the run folder: the view rendered with the part, rendered without it, and the photo
+    - `view`: the view's name
+    - `psnr_on`, `psnr_off`: PSNR of the two rendered pictures against the photo, in dB
     """
 
     on: Inside
@@ -34,11 +36,17 @@ class Pictures(Model):
 
 
 class Found(Model):
-    """Hold the decision about an optional part of a training, as checkpoints keep it.
+    """Hold the decision whether a scene needs an optional part of the training. Checkpoints store it.
 
-    `statistic` was compared with `threshold`. Leaving the part out saves `seconds` and `megabytes`, and costs `decibels` of PSNR on the
-    training views. `side` is the reduced resolution for the part `light`, `total` the reduced number of iterations for `iterations`. A
-    matte scene is measured a second time, halfway through the training; `again` is the result.
+    - `needed`, `why`: the decision, and its reason in words
+    - `statistic`, `threshold`: the measured value, and the value that it was compared with
+    - `seconds`, `megabytes`: what leaving the part out saves
+    - `decibels`: what leaving the part out costs, in PSNR on the training views
+    - `side`: the reduced side of the light's cubemap, in texels; only for the part "light"
+    - `total`: the reduced number of iterations; only for the part "iterations"
+    - `again`: how much colours changed with the view (0..1) when a scene taken for matte was measured a second time, halfway through the
+      training; only for the part "specular"
+    - `pictures`: renderings with and without the part, or None
     """
 
     needed: bool
@@ -55,7 +63,13 @@ class Found(Model):
 
 
 class Row(Model):
-    """Hold a row of needs.json: an optional part (`what`), `why` it was kept or left out, what leaving it out `saved`, and its `cost`."""
+    """Hold a row of needs.json, about an optional part of the training.
+
+    - `what`, `why`: the part, and why it was kept or left out, in words
+    - `needed`: true if the part was kept
+    - `saved`, `cost`: what leaving it out saved and cost, in words
+    - `pictures`: renderings with and without the part, or None
+    """
 
     model_config = ConfigDict(extra="allow")  # the figures behind the words
 
@@ -77,6 +91,6 @@ class Row(Model):
 
 
 class Needs(RootModel[list[Row]]):
-    """Hold a needs.json."""
+    """Hold the rows of needs.json, one for each optional part of the training that was decided about."""
 
     model_config = ConfigDict(frozen=True)

@@ -1,4 +1,4 @@
-"""Refuse pictures by the size that they declare, before memory is taken for their pixels. Decode some by OpenCV."""
+"""Refuse picture files that declare too many pixels, before memory is taken for them. Decode PNG, TIFF and Radiance pictures by OpenCV."""
 
 import re
 from collections.abc import Iterator
@@ -28,9 +28,9 @@ SCANS = 100  # of a JPEG; cameras write 1, and programs 10 of a progressive one.
 
 
 def check_pixels(path: Path, width: int, height: int, small: int = SMALL, per_byte: int = MOST_PER_BYTE) -> None:
-    """Raise InputError if a picture's file declares more than MOST pixels, or more pixels than the file can hold.
+    """Raise InputError if a picture's file declares more than MOST pixels, or more than a file of its size can hold.
 
-    The file is taken to hold at most `per_byte` pixels for each of its bytes, or `small` pixels if that is more.
+    A file of B bytes is assumed to hold at most `per_byte` · B pixels, or `small` pixels if that is more.
     """
     size = f"{path}: {width}×{height} pixels"
     if width * height > MOST:
@@ -40,9 +40,9 @@ def check_pixels(path: Path, width: int, height: int, small: int = SMALL, per_by
 
 
 def check_length(path: Path) -> None:
-    """Check the file of a photo before Pillow opens it. Raises OSError if it is no ordinary file, or empty.
+    """Check the file of a photo before Pillow opens it. Raises OSError if the file is empty, or not an ordinary file.
 
-    Raises ValueError for a WebP, HEIC or AVIF of more than LONGEST bytes: these are read as a whole.
+    Raises ValueError if the file is a WebP, HEIC or AVIF of more than LONGEST bytes, because Pillow reads such files as a whole.
     """
     check_file(path)
     if path.stat().st_size > LONGEST:
@@ -52,7 +52,10 @@ def check_length(path: Path) -> None:
 
 
 def check_chunks(path: Path) -> None:
-    """Raise InputError if a PNG declares more bytes than it has: OpenCV would allocate as many. Other formats are not checked."""
+    """Raise InputError if a chunk of a PNG declares more bytes than the file has. Other formats are not checked.
+
+    Without this check, OpenCV would allocate the declared bytes.
+    """
     size = path.stat().st_size
     with open_file(path) as file:
         for _, length in png_chunks(file):
@@ -61,9 +64,10 @@ def check_chunks(path: Path) -> None:
 
 
 def png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
-    """Yield the name and the declared length of each chunk of a PNG, with `file` at the chunk's data. Yield none for other files.
+    """Yield the name and the declared length of each chunk of a PNG. When it yields, `file` is at the chunk's data.
 
-    A PNG is 8 bytes and then chunks: a length, a name, that many bytes of data, and a checksum (PNG specification, 5.3).
+    Nothing is yielded for other formats. A PNG is 8 bytes and then chunks. A chunk has a length, a name, that many bytes of data, and a
+    checksum (PNG specification, 5.3).
     """
     if file.read(8) != PNG:
         return
@@ -75,10 +79,11 @@ def png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
 
 
 def check_scans(path: Path, width: int, height: int) -> None:
-    """Raise InputError if a JPEG has more than SCANS scans, by which a small file would be decoded for minutes.
+    """Raise InputError if a JPEG has more than SCANS scans. Even a small file with so many would take minutes to decode.
 
-    A segment is 0xFF, a letter, its length, and that many bytes less two. In the pixels' code after it, 0xFF stands only before 0 and the
-    letters of restarts (ITU-T T.81, annex B).
+    Scans are counted by their markers (ITU-T T.81, annex B). A marker is 0xFF and a code byte. After most markers comes a segment: its
+    length in two bytes, which includes these two, and its data. In the compressed pixels, 0xFF is followed only by 0 or by the code of a
+    restart marker. At most 8 · `width` · `height` + LARGEST bytes of the file are searched.
     """
     with open_file(path) as file:
         data = file.read(min(8 * width * height + LARGEST, LONGEST))
@@ -91,7 +96,7 @@ def check_scans(path: Path, width: int, height: int) -> None:
 
 
 def read_png(path: Path, flags: int = -1) -> np.ndarray | None:
-    """Read a PNG of a run as `cv2.imread` does. Return None if it is missing, broken, too large, or no PNG."""
+    """Read a PNG in a run folder as `cv2.imread` does with these `flags`. Return None if it is missing, broken, too large, or no PNG."""
     try:
         check_file(path)
         with Image.open(path, formats=("PNG",)) as picture:
@@ -104,11 +109,13 @@ def read_png(path: Path, flags: int = -1) -> np.ndarray | None:
 
 
 def decode(path: Path, flags: int, width: int, height: int) -> np.ndarray | None:
-    """Decode a PNG, TIFF or Radiance picture as `cv2.imread` does. Return None if it is broken or another kind of picture.
+    """Decode a PNG, TIFF or Radiance picture as `cv2.imread` does with these `flags`. Return None if it is broken or of another format.
 
-    `width` and `height` are what its header says. OpenCV would read many more kinds, by decoders that nobody needs here. That of JPEG 2000
-    in 4.11 writes out of bounds (CVE-2025-53644). Raises OSError if the file cannot be read, and InputError if it is far larger than its
-    pixels can be.
+    `width` and `height` are the size in the picture's header. Raises OSError if the file cannot be read, and InputError if the file is far
+    larger than so many pixels can be.
+
+    Other formats are not given to OpenCV, because nobody needs them here and their decoders are a risk: the JPEG 2000 decoder of OpenCV
+    4.11 writes out of bounds (CVE-2025-53644).
     """
     import cv2  # here, because most lights are EXR
 

@@ -1,4 +1,4 @@
-"""Read and write PLY files. A header is checked against the file's size before memory is reserved for its rows."""
+"""Read and write PLY files. A file's size is checked against its header before memory is reserved for the rows that the header declares."""
 
 import os
 import re
@@ -43,7 +43,10 @@ def write_ply(path: str | os.PathLike, elements: list[PlyElement], comments: Seq
 
 
 def check_header(file, path: Path) -> None:
-    """Check that a PLY file is as long as its header says. Raises InputError if it is not a PLY file, truncated, or too long."""
+    """Check that a PLY file is as long as its header says. `file` is open at its start.
+
+    Raises InputError, which names `path`, if the file is not a PLY file, truncated, or too long.
+    """
     header = file.read(LONGEST_HEADER)
     end = _END.search(header)
     if not header.startswith(b"ply") or end is None:
@@ -75,7 +78,7 @@ def check_header(file, path: Path) -> None:
 
 
 def _count_lines(file, path: Path) -> int:
-    """Count the lines in the rest of a file, without those that are blank. Raises InputError for a line that no row can be."""
+    """Count the lines in the rest of a file, except blank lines. Raises InputError for a line of LONGEST_LINE bytes or more."""
     count = 0
     while line := file.readline(LONGEST_LINE):
         if len(line) == LONGEST_LINE:
@@ -85,10 +88,10 @@ def _count_lines(file, path: Path) -> int:
 
 
 def _elements(lines: list[list[str]], path: Path) -> list[tuple[int, list[tuple[int, float]]]]:
-    """Parse the header of a PLY file. Returns, for each element, its number of rows and a list of sizes.
+    """Parse the lines of a PLY header, split into words. Returns, for each element, its number of rows and a list of its properties' sizes.
 
-    The sizes are the fewest and the most bytes of each property in a binary file. They differ for a list, which has a number that stores
-    its length, and may be empty. Raises InputError for a broken header.
+    A size is a pair: the fewest and the most bytes that the property takes in a row of a binary file. They differ only for a list property,
+    which stores the number of its values before the values. Raises InputError for a broken header.
     """
     elements: list[tuple[int, list[tuple[int, float]]]] = []
     for line in lines:

@@ -9,14 +9,19 @@ from refgs.formats.validate import Model
 
 
 class Progress(Model):
-    """Hold how far a training is, and how many iterations it has in all."""
+    """Hold the iteration that a training has reached, and the total number of its iterations."""
 
     iteration: Count
     total: Count
 
 
 class Record(Model):
-    """Hold how a step of a batch ended: its command's `words` and exit status, its seconds, and the machine."""
+    """Hold how a step of a batch ended.
+
+    - `status`, `seconds`: the exit status and the run time of the step's command
+    - `node`: the name of the machine
+    - `words`: the command, split into words
+    """
 
     status: int
     seconds: Seconds

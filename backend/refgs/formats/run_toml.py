@@ -17,13 +17,23 @@ class Maker(Model):
 
 
 class Made(Model):
-    """Hold the release that made a run. It is read before the rest of run.toml, whose format may differ in a newer release."""
+    """Hold the release of RefGS that made a run, as the table `run` of run.toml states it.
+
+    The release is checked before the other keys are read, because their format may differ in a newer release.
+    """
 
     run: Maker
 
 
 class Trained(Maker):
-    """Hold what a run was trained on. `centre` and `radius` are its region of interest, in the run's frame."""
+    """Hold the table [run] of run.toml: what a run was trained on.
+
+    - `capture`: the folder of the photos
+    - `fingerprint`: a hash of the capture, which tells whether it has changed since
+    - `preset`: the name of the settings' preset
+    - `centre`, `radius`: the region of interest, a ball, in the run's coordinates
+    - `bounded`: true if the photos surround one object, false if they show a room or an open scene
+    """
 
     capture: str
     fingerprint: str
@@ -34,13 +44,13 @@ class Trained(Maker):
 
 
 class Change(Model):
-    """Hold a row of the table [changed]: `asked` is the user's value of a setting that the training has changed."""
+    """Hold a row of the table [changed]: a setting that the training has changed. `asked` is the value that the user gave."""
 
     asked: Any
 
 
 class RunFile(Model):
-    """Hold a run.toml. The settings are checked by `refgs.settings`."""
+    """Hold a run.toml. The table `settings` is not checked here, but by `refgs.settings`."""
 
     run: Trained
     settings: dict[str, Any]

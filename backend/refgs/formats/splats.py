@@ -30,7 +30,7 @@ class Splats:
     - normals (N, 3), unit vectors. They point outwards where that is known.
     - sh (N, K, 3): spherical harmonics, K = (degree + 1)². The colour is 0.5 + SH, as in 3DGS.
     - opacities (N,) in 0..1
-    - scales: standard deviations in world units; (N, 2) for surfels, (N, 3) for 3D Gaussians. The last of three is along the normal.
+    - scales: standard deviations in world units; (N, 2) for surfels, (N, 3) for 3D Gaussians. The third scale is along the normal.
     - rotations (N, 4): unit quaternions wxyz
     - albedo (N, 3), linear Rec.709; metallic (N,) and perceptual roughness (N,) in 0..1
     - received (N, 3): the irradiance, divided by the irradiance without occlusion. It includes light that the object reflects to itself.

@@ -8,9 +8,9 @@ from refgs.formats.mesh import UnwrappedMesh
 def vertex_tangents(mesh: UnwrappedMesh) -> tuple[np.ndarray, np.ndarray]:
     """Compute a unit tangent (V, 3) and a sign (V,) for each vertex, such that bitangent = sign · normal × tangent.
 
-    Tangents point along increasing u. A vertex's tangent is the mean of its faces' tangents. Each is projected to the plane of the vertex's
-    normal and weighted by the face's angle at the vertex (Mikkelsen 2008, "Simulation of Wrinkled Surfaces Revisited"). Vertices on a seam
-    must be doubled, as `unwrap` does.
+    Tangents point along increasing u. A vertex's tangent is the mean of its faces' tangents. Each of these is projected to the plane of the
+    vertex's normal and weighted by the face's angle at the vertex (Mikkelsen 2008, "Simulation of Wrinkled Surfaces Revisited"). A vertex
+    on a seam of the texture coordinates must exist once for each side of the seam, as `unwrap` makes it.
     """
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]

@@ -1,4 +1,4 @@
-"""Describe metadata.json, the camera of a view of TensoIR-Synthetic (`refgs.capture.tensoir` names the layout's source)."""
+"""Describe metadata.json, the camera of one view in the data set TensoIR-Synthetic. `refgs.capture.tensoir` cites the layout's source."""
 
 from pathlib import Path
 from typing import Annotated, Any

@@ -16,14 +16,14 @@ FOLDER = "textures"  # beside the mesh
 
 @dataclass
 class Textures:
-    """Hold the square texture maps of a mesh, S×S texels, float32. The first row is at v = 1.
+    """Hold the square texture maps of a mesh, S×S texels: float32, except `mask`. The first row is at v = 1.
 
     - base_color (S, S, 3), linear Rec.709
     - metallic, roughness and occlusion (S, S)
     - normal (S, S, 3): unit vectors in MikkTSpace tangent space, y along v (OpenGL, glTF and Blender)
-    - mask (S, S): true for a texel if its centre, or a neighbour's centre, lies on the mesh. A bilinear look-up on the mesh reads only
-      these texels. The other texels are padding: copies of the nearest texel in the mask.
-    - doubt (S, S): how unsure it is from the photos whether a texel is metal or paint, 0..1; None if the run has no such values
+    - mask (S, S), bool: true for a texel if its centre, or a neighbour's centre, lies on the mesh. A bilinear look-up on the mesh reads
+      only these texels. The other texels are padding: copies of the nearest texel in the mask.
+    - doubt (S, S) in 0..1: how little the photos tell whether a texel is metal or paint; None if the run has no such values
     - specular: 1, or 0 for a material without specular reflection
     """
 

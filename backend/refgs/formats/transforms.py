@@ -37,7 +37,7 @@ class Intrinsics(Model):
 
     @property
     def lens_keys(self) -> dict[str, Any]:
-        """Return the file's other keys about the lens, with their values. A key counts if its name says so, such as `k1` or `lens_type`."""
+        """Return the file's keys that describe the lens but are no fields of this class, such as `k1`, with their values."""
         return {key: value for key, value in (self.model_extra or {}).items() if _of_lens(key)}
 
 
@@ -63,7 +63,7 @@ class Frame(Intrinsics):
 
     @property
     def path(self) -> str:
-        """Return the photo's path as the file gives it, with forward slashes. It is relative to the file's folder."""
+        """Return the photo's path with forward slashes, relative to the folder of the file that has the frame."""
         return self.file_path.replace("\\", "/")
 
     @model_validator(mode="after")
@@ -88,9 +88,11 @@ class _Cameras(Model):
 
 
 class Transforms(_Cameras):
-    """Hold the cameras of a file, and three things that only some programs write. These are None if the file lacks them.
+    """Hold the cameras of a file, and values that only some programs write. Such a value is None if the file lacks it.
 
-    They are the names of the training, test and validation photos, the path of a point cloud, and the matrix `to_capture`.
+    - `train_filenames`, `test_filenames`, `val_filenames`: the names of the training, test and validation photos
+    - `ply_file_path`: the path of a point cloud
+    - `to_capture`: the matrix (4, 4) from a run's coordinates to those of the capture that it was trained on
     """
 
     frames: list[Frame]
@@ -102,7 +104,12 @@ class Transforms(_Cameras):
 
 
 class RunFrame(Frame):
-    """Hold a camera of a run. The photo's radiance is the scene's, times `exposure`: one number, or one each for red, green and blue."""
+    """Hold a camera in a run's cameras.json.
+
+    - `split`: "train", or "test" for a held-out view
+    - `exposure`: the photo's radiance divided by the scene's; one number, or one each for red, green and blue
+    - `refined`: true if the training refined the camera's pose
+    """
 
     split: Literal["train", "test"] = "train"
     exposure: Positive | Vector = 1.0
@@ -110,20 +117,20 @@ class RunFrame(Frame):
 
 
 class RunCameras(_Cameras):
-    """Hold the cameras of a run, in the run's frame."""
+    """Hold a run's cameras.json: cameras in the run's coordinates, and the matrix `to_capture` from these to the capture's coordinates."""
 
     frames: list[RunFrame]
     to_capture: Matrix
 
 
 class NovelFrame(Frame):
-    """Hold a camera of Stanford-ORB's transforms_novel.json: its photo is in the folder `scene_name`."""
+    """Hold a camera in Stanford-ORB's transforms_novel.json. Its photo, in the folder `scene_name`, shows the object in another scene."""
 
     scene_name: str
 
 
 class NovelCameras(_Cameras):
-    """Hold a transforms_novel.json of Stanford-ORB."""
+    """Hold Stanford-ORB's transforms_novel.json: the cameras of photos that show the same object in other scenes."""
 
     frames: list[NovelFrame]
 
@@ -134,7 +141,7 @@ def read_transforms(file: Path) -> Transforms:
 
 
 def read_novel_transforms(file: Path) -> NovelCameras:
-    """Read a transforms_novel.json. Raises InputError naming the file, the frame and the value that is wrong."""
+    """Read Stanford-ORB's transforms_novel.json. Raises InputError naming the file, the frame and the value that is wrong."""
     return read_json(file, NovelCameras, "Download the data set again.")
 
 

@@ -1,6 +1,7 @@
 """Read JSON and TOML files into validated models.
 
-What is wrong with a file becomes an InputError of one line: the file, the field, what is wrong with it, and what to do.
+A file that is wrong raises an InputError of one line: the file, the field, what is wrong with it, and what to do. The caller says what to
+do by the argument `again`, such as "Train again."
 """
 
 import json
@@ -23,7 +24,7 @@ Matrix = list[list[float]]
 
 
 class Model(BaseModel):
-    """Describe the fields of a file that are read. All others are ignored."""
+    """Declare the fields of a file that are read, in a subclass for each kind of file. Other fields of the file are ignored."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -32,27 +33,33 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def read_json(file: Path, model: type[M], again: str) -> M:
-    """Read a JSON file into a model. `again` says what to do about a file that is missing or wrong: it ends the InputError's message."""
+    """Read a JSON file into a model. Raises InputError if it is missing or wrong. `again`, advice for the user, ends the message."""
     return validated(parse_json(read_text(file, again), str(file), again), model, str(file), again)
 
 
 def read_toml(file: Path, model: type[M], again: str) -> M:
-    """Read a TOML file into a model. `again` says what to do about a file that is missing or wrong: it ends the InputError's message."""
+    """Read a TOML file into a model. Raises InputError if it is missing or wrong. `again`, advice for the user, ends the message."""
     return validated(read_tables(file, again), model, str(file), again)
 
 
 def read_tables(file: Path, again: str) -> dict[str, Any]:
-    """Read a TOML file as nested dicts. Raises InputError if the file is missing or not TOML. `again`, the advice, ends the message."""
+    """Read a TOML file as nested dicts. Raises InputError if it is missing or broken. `again`, advice for the user, ends the message."""
     return parse_toml(read_text(file, again), str(file), again)
 
 
 def parse_json(text: str, source: str, again: str) -> Any:
-    """Parse JSON. Raises InputError, whose message begins with `source` and ends with `again`, the advice."""
+    """Parse JSON. Raises InputError if it is broken.
+
+    The error's message begins with `source` and ends with `again`, advice for the user.
+    """
     return _parsed(json.loads, text, source, "JSON", again)
 
 
 def parse_toml(text: str, source: str, again: str) -> dict[str, Any]:
-    """Parse TOML as nested dicts. Raises InputError, whose message begins with `source` and ends with `again`, the advice."""
+    """Parse TOML as nested dicts. Raises InputError if it is broken.
+
+    The error's message begins with `source` and ends with `again`, advice for the user.
+    """
     return _parsed(tomllib.loads, text, source, "TOML", again)
 
 
@@ -69,9 +76,9 @@ def _parsed(loads: Callable[[str], Any], text: str, source: str, kind: str, agai
 
 
 def validated(data: Any, model: type[M], source: str, again: str) -> M:
-    """Make a model of what `json` or `tomllib` returned.
+    """Check data that `json` or `tomllib` returned, and convert it to a model.
 
-    Raises InputError if the data does not fit the model. The message begins with `source` and ends with `again`, the advice.
+    Raises InputError if the data does not fit the model. The message begins with `source` and ends with `again`, advice for the user.
     """
     try:
         return model.model_validate(data)
@@ -84,9 +91,10 @@ def validated(data: Any, model: type[M], source: str, again: str) -> M:
 
 
 def _place(error: Any, data: Any) -> tuple[list[str], str]:
-    """Return where pydantic found an error: in which frame, as a list of at most one text, and the field's keys joined by dots.
+    """Return where in `data` pydantic found an error: the frame, if any, and the field's keys joined by dots.
 
-    A frame is a dict with a `file_path`, as in transforms.json. The list is empty for a field outside all frames.
+    A frame is a dict with a `file_path`, as in transforms.json. It is returned as a list of one text, "frame PATH". The list is empty for a
+    field outside all frames.
     """
     where, keys = [], []
     for part in error["loc"]:

@@ -1,7 +1,7 @@
-"""Tell where masks show an object's surface: where rays through its outlines touch the visual hull on a short length only.
+"""Find where masks show an object's surface: where a ray through a mask's outline meets the visual hull only near one point.
 
-A ray through a photo's outline touches the object somewhere. If it touches the hull only near one point, the surface is there. If it runs
-along the hull, as over a bowl's lid or along a flat face, the surface may be anywhere below.
+A ray through an outline touches the object somewhere. If it meets the hull only near one point, the surface is there. If it runs along the
+hull, the surface may be anywhere below the hull. It does so along a flat face, and across the opening of a bowl, which the hull closes.
 """
 
 from collections.abc import Sequence
@@ -21,8 +21,9 @@ ACROSS = 200  # pixels across the object, in the reduced masks
 def contact(shape: Shape, alphas: Sequence[np.ndarray], cameras: Sequence[Camera]) -> np.ndarray:
     """Measure how well outlines show the surface at each voxel. Returns (X, Y, Z) in world units; smaller is better.
 
-    Rays run from the cameras through the outlines of the masks. A voxel's value is half the length on which a ray through it runs in the
-    shape. If several rays pass the voxel, the least of their values counts. The value is infinite if no ray passes.
+    `shape` is the visual hull, and `alphas` are the masks (H, W), uint8. Rays run from the cameras through the outlines of the masks. A
+    voxel's value is half the length on which a ray through it runs in the shape. If several rays pass the voxel, the least of their values
+    counts. The value is infinite if no ray passes.
     """
     centre, radius = shape.ball
     step = STEP * float(shape.voxel.min())

@@ -1,4 +1,4 @@
-"""Carve hollows, which masks do not show, into a visual hull. A cell is hollow if photos see through it to a surface behind."""
+"""Carve hollows, which masks do not show, into a visual hull. A cell of voxels is hollow if photos see through it to a surface behind."""
 
 from collections.abc import Sequence
 
@@ -22,9 +22,10 @@ def carve_hollows(alpha: np.ndarray, low: np.ndarray, voxel: np.ndarray, photos:
     """Remove cells from a visual hull if photos see through them. Returns the fraction of each voxel that is left, (X, Y, Z) in 0..1.
 
     The hull is where `alpha` (X, Y, Z) is above one half. Voxels have the size `voxel` (3,), and the first has its corner at `low` (3,), in
-    world units. A cell is a cube of CELL³ voxels. It is empty if enough photos see a surface behind it (see
-    `stereo.depth_maps`), and few photos see a surface in it. The light must stand still. If it turns with the camera, highlights look like
-    a surface on the axis of the turntable.
+    world units. A cell is a cube of CELL³ voxels. It is empty if enough photos see a surface behind it (see `stereo.depth_maps`), and few
+    photos see a surface in it.
+
+    The light must not move relative to the object. On a turntable it does, and highlights look like a surface on the turntable's axis.
     """
     shape = Shape(alpha > 0.5, np.asarray(low), np.asarray(voxel))
     cells = Shape(shape.solid[::CELL, ::CELL, ::CELL], shape.low, CELL * shape.voxel)
@@ -39,7 +40,12 @@ def carve_hollows(alpha: np.ndarray, low: np.ndarray, voxel: np.ndarray, photos:
 
 
 def _empty(shape: Shape, maps: Sequence[DepthMap], least: float) -> np.ndarray:
-    """Tell which cells of a shape are empty. The depth maps vote: at least `least` of the photos must see through a cell."""
+    """Tell which cells of a shape are empty: bool (X, Y, Z). Depth maps vote, with the weights of their depths.
+
+    A map votes for a cell if its surface lies behind the cell, and against if its surface lies in the cell. A cell is empty if at least
+    `least` maps see through it, and if more than the fraction FREE of the votes is for it. Votes are smoothed over neighbouring cells. The
+    voxels of `shape` are the cells.
+    """
     cells = np.argwhere(shape.solid)
     points = shape.low + (cells + 0.5) * shape.voxel
     band = BAND * shape.ball[1]

@@ -166,7 +166,7 @@ def _sample_triangles(vertices: np.ndarray, faces: np.ndarray, count: int, rng: 
 
 
 def _choose_evenly(dense: np.ndarray, count: int) -> np.ndarray:
-    """Choose `count` points that are evenly spaced from the many points `dense`, by a few Lloyd iterations.
+    """Choose `count` evenly spaced points from `dense`, which has many more, by a few Lloyd iterations. Returns (count, 3).
 
     Each iteration groups all points by the nearest chosen point. Then the point nearest to a group's mean is chosen for the group.
     """

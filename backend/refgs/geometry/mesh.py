@@ -58,13 +58,13 @@ def clean(mesh: Mesh, triangles: int) -> SmoothMesh:
 
 
 def _large(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Mark the faces (F,) that do not belong to crumbs, as `clean` defines them."""
+    """Mark the faces (F,) of all connected parts except crumbs, which have less than KEEP times the largest part's area."""
     part, areas = parts(mesh)
     return (areas >= KEEP * areas.max())[part]
 
 
 def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Close small holes, as `clean` defines them. Each is filled with a fan of triangles around the mean of the hole's vertices."""
+    """Close holes of at most HOLE edges. Each is filled with a fan of triangles around the mean of the hole's vertices."""
     border = _border(mesh)
     if not len(border):
         return mesh
@@ -82,7 +82,7 @@ def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _untrimmed(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Mark the faces (F,) that belong neither to crumbs nor to frays, as `clean` defines them.
+    """Mark the faces (F,) that belong neither to crumbs (small loose parts) nor to frays (narrow strips at a border). See `clean`.
 
     This is a morphological opening of the surface. FRAY rings of faces are removed along the borders. The pieces that have become crumbs
     are removed too. What remains grows back by FRAY rings. Surfaces fray where photos end, because few photos show what is there.

@@ -20,9 +20,9 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def pixel_rays(camera: Camera, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the rays (N, 3) through pixels (N,), in the world's axes. Each is one unit long along the camera's axis.
+    """Return rays (N, 3) through N pixels, in the world's axes. Each ray's component along the camera's axis is 1.
 
-    `rows` and `columns` are indices of pixels, and may be fractions: 0 is the centre of the first.
+    `rows` and `columns` (N,) are indices of pixels, and may be fractions: 0 is the centre of the first.
     """
     x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
     return np.stack([x, y, np.ones(len(x))]).T @ camera.world_to_camera[:3, :3]

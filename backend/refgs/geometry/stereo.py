@@ -44,9 +44,9 @@ class Photo(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Hold the shape in which a surface must lie.
+    """Hold a part of space, made of voxels, in which a surface must lie.
 
-    `solid` (X, Y, Z), bool, marks its voxels. The first voxel has the corner `low` (3,) and the size `voxel` (3,).
+    `solid` (X, Y, Z), bool, tells which voxels belong to it. The first voxel has the corner `low` (3,) and the size `voxel` (3,).
     """
 
     solid: np.ndarray
@@ -61,7 +61,7 @@ class Shape:
         return (first + last) / 2, float(np.linalg.norm(last - first)) / 2
 
     def fit(self, camera: Camera, across: int) -> Camera:
-        """Return the camera for a picture so reduced that the shape's ball is `across` pixels wide. A picture is never enlarged."""
+        """Return the camera for a reduced picture, in which the shape's ball is `across` pixels wide. Pictures are never enlarged."""
         centre, radius = self.ball
         distance = float(np.linalg.norm(camera.position - centre))
         side = across * max(camera.width, camera.height) * distance / (2 * radius * camera.fx)
@@ -109,7 +109,7 @@ def depth_maps(photos: Sequence[Photo], shape: Shape, unsure: np.ndarray) -> lis
 
     Returns a map for each photo that has at least BEST neighbours. A depth has a weight above 0 only if the neighbours show the photo's
     texture in the same place, and if the depth maps of at least AGREE neighbours agree with it. A mirror shows images of other things
-    behind its surface. Such images seldom agree in a curved mirror, but they do in a flat one.
+    behind its surface. Such images seldom agree in a curved mirror, but they do in a flat one, so its depths may be wrong.
     """
     centre, radius = shape.ball
     reduced = [_reduced(photo, shape) for photo in photos]
@@ -148,7 +148,7 @@ def _sweep(photo: _Reduced, others: list[_Reduced], shape: Shape, unsure: np.nda
     """Find the depth of each pixel of a photo, by comparing the photo with `others` on planes at many depths.
 
     A pixel gets the depth of the plane on which the photo looks most like `others`. A plane counts only if the pixel's ray meets it near or
-    in a solid voxel of `shape`. `unsure` is as in `depth_maps`.
+    in a solid voxel of `shape`. Pixels get no depth if their rays enter the shape outside of the voxels `unsure` (X, Y, Z), bool.
     """
     camera, (centre, radius) = photo.camera, shape.ball
     middle = float(camera.world_to_camera[2, :3] @ centre + camera.world_to_camera[2, 3])
@@ -225,12 +225,16 @@ def _scores(
 
 
 def _intrinsics(camera: Camera) -> np.ndarray:
-    """Return the matrix (3, 3) from rays to pixels whose centres are at integers, as OpenCV has them."""
+    """Return the matrix (3, 3) that projects points in camera coordinates to pixels. As in OpenCV, the centre of a pixel is at integers."""
     return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
 
 
 def _agreed(i: int, near: list[np.ndarray], maps: dict[int, DepthMap], tolerance: float) -> DepthMap:
-    """Return the depth map of photo `i`. Drop the depths on which fewer than AGREE of its neighbours' maps agree."""
+    """Return the depth map of photo `i`, with weight 0 for depths on which fewer than AGREE of its neighbours' maps agree.
+
+    `near[i]` has the indices of the photo's neighbours, and `maps` has the depth maps by index. Two depths agree if they differ by less
+    than `tolerance`, in world units.
+    """
     camera, depth, weight = maps[i]
     rows, columns = np.nonzero(weight)
     points = camera.position + pixel_rays(camera, rows, columns) * depth[rows, columns, None]

@@ -106,7 +106,7 @@ def _blocks_of_pixels(
 
 
 class _View:
-    """Compute signed distances of voxels from one depth map, with weights."""
+    """Compute signed distances from voxels to the surface in one depth map, and the weights of these distances."""
 
     def __init__(self, depth: Tensor, alpha: Tensor, camera: Camera, low: np.ndarray, voxel: float):
         self.camera = camera = camera.resized(*depth.shape[::-1])

@@ -111,9 +111,10 @@ def build(target: Target, cache: Path) -> Path:
 
 @contextmanager
 def _sole_build(cache: Path) -> Iterator[None]:
-    """Wait until no other process builds in `cache`. Remove what killed builds have left there.
+    """Lock `cache` during the `with` block, so that no other process builds in it. Remove what killed builds have left there.
 
-    Raises OSError if the lock cannot be opened, for `cache` cannot be written, say. On a file system without locks, do not wait.
+    Waits while another process has the lock. On a file system without locks, this does nothing. Raises OSError if the lock cannot be
+    opened, for example because `cache` cannot be written.
     """
     file = cache / "build.lock"
     lock = FileLock(file)

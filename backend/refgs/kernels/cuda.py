@@ -134,7 +134,7 @@ def _function(name: str, device: int):
 
 
 def launch(name: str, work: ctypes.Structure, device: torch.device, blocks: int, threads: int = BLOCK) -> None:
-    """Run the kernel `name` on a CUDA card, in torch's current stream. `threads` is the number of threads a block.
+    """Run the kernel `name` on a CUDA card, in torch's current stream: `blocks` blocks of `threads` threads each.
 
     `work` holds the kernel's arguments. The tensors that it points at must exist until the kernel is done.
     """

@@ -96,7 +96,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def on_gpu(tensor: torch.Tensor) -> bool:
-    """Tell whether a tensor is on a CUDA card. Its kernels then run there too."""
+    """Tell whether a tensor is on a CUDA card. Kernels that use the tensor then run there, too."""
     return tensor.device.type == "cuda"
 
 

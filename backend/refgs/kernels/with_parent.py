@@ -1,7 +1,7 @@
 """Run a program that ends with its parent, even if the parent is killed: `python with_parent.py PROGRAM ARGUMENT…`.
 
-The parent holds the other end of this process's standard input, which the system closes when the parent ends. Then the program and all
-processes that it has started are killed. On Windows, only the program is killed, not what it has started.
+The parent starts this script with a pipe as standard input. When the parent ends, the system closes the pipe. Then this script kills the
+program and all processes that the program has started. On Windows, it kills only the program.
 """
 
 import os

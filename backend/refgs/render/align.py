@@ -25,7 +25,10 @@ DAMPING = 1e-3  # of the mean diagonal
 
 
 def posed(camera: Camera, pose: Tensor, centre: np.ndarray, radius: float) -> Camera:
-    """Return the camera that sees the resting scene as `camera` sees the scene moved by `pose` (6,)."""
+    """Return the camera that sees the unmoved scene as `camera` sees the scene moved by `pose` (6,).
+
+    `pose` is a rotation vector around `centre`, in radians, then a translation in units of `radius`.
+    """
     turn, shift = pose.double().numpy(force=True).reshape(2, 3)
     motion = np.eye(4)
     motion[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
@@ -37,12 +40,13 @@ def posed(camera: Camera, pose: Tensor, centre: np.ndarray, radius: float) -> Ca
 def pose_step(
     rendering: Rendering, photo: Tensor, camera: Camera, centre: np.ndarray, radius: float, reduction: int = 1
 ) -> Tensor:
-    """Compute the pose (6,) that moves the rendering of `camera` towards the photo (H, W, 3). Return zeros if the rendering is empty.
+    """Compute the pose (6,), as in `posed`, that moves the rendering of `camera` towards the photo (H, W, 3): one Gauss-Newton step.
 
-    The photo and the rendering's picture are sRGB-encoded. Both are first reduced by the factor `reduction`. The pose minimises
-    Σ w |photo − picture + ∇ · motion(pose)|² over the pixels and channels. motion(pose) is how far the pose moves a pixel. ∇ is the mean of
-    the gradients of picture and photo, by central differences. With this mean, the steps converge faster than with the gradient of one of
-    them (Benhimane and Malis 2004). The weight w is small where picture and photo differ much.
+    The pose is zero if the rendering is empty. The photo and the rendering's picture are sRGB-encoded. Both are first averaged over squares
+    of `reduction` pixels. The pose minimises Σ w |photo − picture + ∇ · motion(pose)|² over the pixels and channels. motion(pose) is how
+    far the pose moves a pixel. ∇ is the mean of the gradients of picture and photo, by central differences. With this mean, the steps
+    converge faster than with the gradient of one of them (Benhimane and Malis 2004). The weight w is small where picture and photo differ
+    much.
     """
     maps = [rendering.color.clamp(0, 1), photo, rendering.blended_depth[..., None], rendering.alpha[..., None]]
     color, photo, depths, alpha = (_reduced(value, reduction) for value in maps)
@@ -71,9 +75,8 @@ def _normal_equations(
 ) -> tuple[Tensor, Tensor]:
     """Return the matrix (6, 6) and the right side (6,) of a pose's normal equations, in float64.
 
-    Both are sums over the pixels at `rows` and `columns`.
-    `maps` holds four maps: the gradient of the picture to the right and the one down (H, W, 3), the difference photo − picture (H, W, 3),
-    and the depth (H, W).
+    Both are sums over the pixels at `rows` and `columns`. `maps` holds four maps: the gradient of the picture to the right and the one down
+    (H, W, 3), the difference photo − picture (H, W, 3), and the depth (H, W).
     """
     across, down, apart, depth = (value[rows, columns].double() for value in maps)
     x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy

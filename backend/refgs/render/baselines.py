@@ -90,11 +90,15 @@ LINEAR, SCREEN = LinearLight(), ScreenLight()
 class Method:
     """Describe a method of rendering surfels. The defaults describe RefGS's own method.
 
+    - `lit`: false if the method has no materials and no light
+    - `deferred`: true if the surfels' features are blended first, and then each pixel is shaded
+    - `mirror`: true if reflections are a sharp mirror image of the light
+    - `light`: how the values of the light represent radiance
     - `draw`: a function that replaces deferred shading; it takes the arguments of `render`. None keeps deferred shading.
     - `unread`: names of the surfels' parameters that do not affect pictures. They are not trained.
     - `constants`: parameters that have the same raw value for all surfels, {name: value}. They are not trained.
-    - `left_out`: the features of RefGS that the method lacks, as entries of needs.json. An entry has three texts: "what" is left out, "why"
-      it is, and what that has "saved".
+    - `left_out`: the features of RefGS that the method lacks, as rows of needs.json. A row has three texts: "what" is left out, "why", and
+      what that has "saved".
     """
 
     lit: bool = True

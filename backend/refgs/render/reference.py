@@ -117,11 +117,12 @@ def shade(
     by_direction: bool = False,
     matte: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Shade float64 tensors as `refgs.render.shade.shade` does. `levels` and `sides` are the prefiltered light, rotated by `turn` (3, 3).
+    """Shade float64 tensors as `refgs.render.shade.shade` does. Returns picture, normal, material, radiance, and a margin (H, W).
 
-    Returns picture, normal, material, radiance, and a margin (H, W). Derivatives jump at some values: for example, those of a bilinear
-    look-up jump at texel centres. The margin is a pixel's smallest distance from such a value. Where it is tiny, a rounding error can
-    change a derivative.
+    `levels` and `sides` are the prefiltered light. `turn` (3, 3) rotates directions from the world's axes to the light's.
+
+    Derivatives jump at some values: for example, those of a bilinear look-up jump at texel centres. The margin is a pixel's smallest
+    distance from such a value. Where it is tiny, a rounding error can change a derivative.
     """
     view, pixels = torch.from_numpy(camera.world_to_camera), torch.nonzero(alpha > COVERED, as_tuple=True)
     here, margins = alpha[pixels], []
@@ -181,9 +182,10 @@ def radiance_towards(
 
     - `maps` (P, 8 or more): normal, albedo, metallic, roughness; with `indirect` also irradiance divided by that of an unoccluded surface
     - `appearance` (P, 3): a colour that replaces diffuse shading, or None
-    - `levels`, `sides`: the prefiltered light, rotated by `turn`
-    - `indirect`: whether the mirror direction is unoccluded (P, 1), and the radiance from the object there (P, 3); or None
+    - `levels`, `sides`: the prefiltered light. `turn` (3, 3) rotates directions from the world's axes to the light's.
+    - `indirect`: 1 where the mirror direction is unoccluded, else 0 (P, 1), and the radiance from the object there (P, 3); or None
     - `margins`: a list, to which distances from jumps of the derivatives are appended (see `shade`)
+    - `mirror`, `matte`: as in `refgs.render.shade.shade`
     """
     normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
     if turn is not None:
@@ -264,8 +266,9 @@ def _cube_margins(directions: Tensor, sides: list[Tensor], margins: list) -> Non
 def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor, margins: list) -> Tensor:
     """Look up the prefiltered light in P unit directions (P, 3), for roughnesses (P,). Returns the radiance (P, 3).
 
-    `levels` are what `prefilter` returns, with the sides `sides`. Radiance is interpolated, so that its derivatives jump where a look-up
-    passes from one texel or level to the next. How far each look-up is from there is appended to `margins` (see `shade`).
+    `levels` are what `prefilter` returns, and `sides` are their sides in texels. Radiance is interpolated, so its derivatives jump where a
+    look-up passes from one texel or level to the next. The distance of each look-up from such a jump is appended to `margins` (see
+    `shade`).
     """
     known, alpha = torch.tensor(prefilter.ROUGHNESS, dtype=roughness.dtype), roughness**2
     interval = (torch.bucketize(roughness.detach().contiguous(), known) - 1).clamp(0, len(known) - 2)

@@ -59,8 +59,8 @@ def mirror(directions, normals):
 def _split_sum(albedo: Tensor, metallic: Tensor, roughness: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
     """Return the specular reflectance (P, 3) and the diffuse reflectance (P, 3) of materials.
 
-    Multiply the first by prefiltered radiance from the mirror direction, the second by irradiance / π. `cosine` (P,) is that of the angle
-    between normal and viewing direction.
+    Multiply the first by prefiltered radiance from the mirror direction, the second by irradiance / π. `cosine` (P,) is the cosine of the
+    angle between normal and viewing direction.
     """
     metal, dielectric = reflectance(cosine, roughness, albedo)
     metallic = metallic[:, None]
@@ -132,8 +132,8 @@ class Transport:
     def chunks(self):
         """Split the surfels into chunks, so that large arrays are needed for only one chunk at a time.
 
-        Yields for each chunk a slice that selects its surfels, a slice that selects their rays, and the index in the chunk of each ray's
-        surfel. The rays are only those that hit the mesh.
+        Yields for each chunk a slice that selects its surfels, a slice that selects their rays, and for each ray the index of its surfel in
+        the chunk. The rays are only those that hit the mesh.
         """
         for start in range(0, len(self.normals), CHUNK):
             end = min(start + CHUNK, len(self.normals))
@@ -160,7 +160,7 @@ def blend(surfels: Surfels, normals: np.ndarray, points: np.ndarray, outward: np
 
 
 def relit(transport: Transport, light: Environment, bounces: int = BOUNCES) -> Surfels:
-    """Return the surfels relit by `light`: with new `sh` (diffuse colour) and `indirect` (radiance from the object itself).
+    """Return the surfels relit by `light`: with new `sh_*` (diffuse colour) and `indirect_*` (radiance from the object itself).
 
     `transport` holds the surfels' traced rays. `bounces` counts the reflections between parts of the object. Render the result with the
     setting diffuse = "sh" and with the occluder of `transport`.
@@ -175,8 +175,8 @@ def relit(transport: Transport, light: Environment, bounces: int = BOUNCES) -> S
 def received(surfels: Surfels, occluder: Occluder, light: Environment) -> Tensor:
     """Compute each surfel's irradiance divided by the irradiance of an unoccluded surface: (N, 3).
 
-    It includes the object's shadows and the light that the object reflects onto itself. Normals may point inward or outward. For speed,
-    rays are traced from a random subset of the surfels. The others interpolate the result.
+    The irradiance includes the object's shadows and the light that the object reflects onto itself. The surfels' normals may point inward
+    or outward. For speed, rays are traced from a random subset of the surfels. The others interpolate the result.
     """
     mesh, positions = occluder.mesh, surfels.positions.double().numpy()
     near = cKDTree(mesh.vertices).query(positions)[1]

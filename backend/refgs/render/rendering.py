@@ -14,15 +14,15 @@ SOLID = 0.5  # alpha from which on a pixel shows the surface
 class Rendering:
     """Hold the picture of a camera, and the maps from which it was shaded.
 
-    `color` (H, W, 3) is sRGB-encoded and includes the background. The maps are means over the surfels of each pixel, weighted by alpha, and
-    zero where nothing is:
+    `color` (H, W, 3) is sRGB-encoded and includes the background. `alpha` (H, W) is the coverage by surfels. These maps are means over the
+    surfels of each pixel, weighted as they are blended, and zero where no surfel is:
 
     - `normal` (H, W, 3): in world space, towards the camera, not normalised
     - `depth` (H, W): along the camera's axis; `blended_depth` is `depth` times alpha
     - `material` (H, W, 5): albedo (linear), metallic, roughness; None without a light
-    - `visibility` (H, W): 0 where the object occludes the mirror direction, else 1; None without inter-reflection
 
-    `background` (3,) and `exposure` (3,) are the arguments of `render`; without them, the background is black and the exposure 1.
+    `visibility` (H, W) is 0 where the object occludes the mirror direction, else 1; None without inter-reflection. `background` (3,) and
+    `exposure` (3,) are the arguments of `render`; without them, the background is black and the exposure 1.
     """
 
     color: Tensor

@@ -161,8 +161,8 @@ class _Shade(Function):
 def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
     """Compute the mirror direction of each pixel (H, W, 3): the viewing direction reflected at the blended normal. No gradients.
 
-    `shade` looks up the light in these directions. They are unit vectors in world space, and zero where nothing is. Takes the `features`
-    and `alpha` that `shade` takes together with `visibility`. Raises ValueError for features of another shape.
+    `shade` looks up the light in these directions. They are unit vectors in world space, and zero where nothing is. `features` (H, W, 17)
+    and `alpha` (H, W) are those that `shade` takes if it is also given `visibility`. Raises ValueError for features of another shape.
     """
     if features.shape != (*alpha.shape, CHANNELS + INDIRECT):
         raise ValueError(f"expected {CHANNELS + INDIRECT} features a pixel, got {tuple(features.shape)}")

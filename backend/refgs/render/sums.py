@@ -16,8 +16,9 @@ def pixel_sums(
 ) -> Tensor:
     """Sum an image over each surfel's pixels, weighted by the surfel's blending weights. Returns the sums (N, C).
 
-    The surfels' `features` (N, C) are drawn as a picture (H, W, C). `weigh` makes the image (H, W, C) of this picture. Autograd computes
-    the sums, as the gradient of Σ picture · image with respect to the features. Surfels nearer to the camera than `near` are not drawn.
+    The surfels' `features` (N, C) are drawn as a picture (H, W, C). From this picture, `weigh` computes the image (H, W, C) to sum.
+    Autograd computes the sums, as the gradient of Σ picture · image with respect to the features. Surfels nearer to the camera than `near`
+    are not drawn.
     """
     features = features.detach().clone().requires_grad_()
     with torch.enable_grad():
