@@ -1,4 +1,4 @@
-"""Load a capture's photos for training. To save memory, those of a large capture are cached as NumPy files and memory-mapped.
+"""Load a capture's photos for training. To save memory, photos of a large capture are cached as NumPy files and memory-mapped.
 
 A photo's cache files are named by a hash of all that its pixels depend on. A resumed training reuses the files whose hash is unchanged, and
 writes new ones for the other photos.

@@ -34,7 +34,7 @@ LAYOUTS = {
 
 
 def check(capture: Capture, out: Path) -> dict[str, Any]:
-    """Describe a capture in text with warnings. Write cameras.json, and thumbnails of up to 12 photos, for a program that displays it.
+    """Describe a capture in text with warnings. Write cameras.json and up to 12 thumbnails for a program that displays the capture.
 
     These files are written to the folder `out`, over those of an earlier check. Returns a dict: the paths `capture`, `cameras` and
     `thumbnails`; `centre` and `radius` of the region of interest (a ball), in the coordinates of cameras.json; and `lines`, the text from

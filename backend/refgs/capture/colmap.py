@@ -46,9 +46,9 @@ class Model(NamedTuple):
 
 
 def find_model(folder: Path) -> Model | None:
-    """Find the COLMAP model of a capture that has the most photos. Return None if there is no model.
+    """Find a capture's COLMAP model. If there are several, return the one with the most photos. Return None if there is none.
 
-    If several models have equally many photos, return the one whose folder comes first in _MODELS. `folder` is the capture's folder, or its
+    Of models with equally many photos, the one whose folder comes first in _MODELS is returned. `folder` is the capture's folder, or its
     subfolder `images_N` with reduced photos.
     """
     reduced = re.fullmatch(r"images_\d+", folder.name) is not None
@@ -145,9 +145,9 @@ def _passed_over(model: Model, count: int) -> list[str]:
 
 
 def _find(photos: Files, name: str) -> Path | None:
-    """Find a photo by the name that the model gives it, also without a first folder `images` or `input` in this name.
+    """Find a photo by the name that the model gives it. Return None if it is missing.
 
-    The name has such a folder if COLMAP was run on the folder above.
+    If COLMAP was run on the folder above that of the photos, the name begins with a folder `images` or `input`. This is dropped if needed.
     """
     first, _, rest = name.replace("\\", "/").partition("/")
     return photos.find(name) or (photos.find(rest) if fold(first) in PHOTO_FOLDERS else None)

@@ -35,7 +35,7 @@ INSIDE_FEATURES = (
 
 
 def choose_pairs(database: Path) -> list[tuple[int, int]]:
-    """Choose which photos in COLMAP's database to match. Returns pairs of indices of photos, which are sorted by file name.
+    """Choose which photos in COLMAP's database to match. Returns pairs of photo indices, which follow the order of the file names.
 
     With up to ALL_PAIRS photos, every pair is matched. With more, each photo is matched with two groups:
 

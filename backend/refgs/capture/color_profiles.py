@@ -210,8 +210,8 @@ def _of_code_points(primaries: int, transfer: int) -> Profile:
 def _of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Profile:
     """Return the profile of a PNG's gAMA (`gamma`) and cHRM (`chromaticities`: x and y of white, red, green and blue).
 
-    A gamma of 0.45455, or None, stands for sRGB's curve: the PNG specification lets encoders write it so. None for `chromaticities` stands
-    for Rec.709. Raises Unusable.
+    A gamma of 0.45455 stands for sRGB's curve, because the PNG specification lets encoders write this number for sRGB. So does None. None
+    for `chromaticities` stands for Rec.709. Raises Unusable.
     """
     curve = srgb_decode if not gamma or abs(gamma - 0.45455) < 5e-5 else _power(1 / gamma)  # Adobe RGB has 0.45471
     white, primaries = (chromaticities[:2], chromaticities[2:]) if chromaticities else ((), ())

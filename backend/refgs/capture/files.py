@@ -29,7 +29,7 @@ _MASK_WORDS = re.compile(r"(?:mask|alpha|matte)[-_. ](?P<after>.+)|(?P<before>.+
 
 
 def is_image(name: str) -> bool:
-    """Tell by its name whether a file is an image. Hidden files are none, such as ._NAME.jpg, which macOS writes."""
+    """Tell by its name whether a file is an image. Hidden files, such as the ._NAME.jpg that macOS writes, do not count."""
     return not name.startswith(".") and os.path.splitext(name)[1].lower() in _RANKS
 
 
@@ -207,7 +207,7 @@ def find_photos(folder: Path) -> list[Path]:
 
 
 def photos_in(files: Files, folder: Path, deep: bool) -> list[Path]:
-    """List the photos in a folder, by the rules of `find_photos`. If `deep` is true, also list those in its subfolders, except masks'."""
+    """List the photos in a folder, by the rules of `find_photos`. If `deep` is true, search subfolders, too, except folders of masks."""
     names, masks = files.images(folder), files.masks_beside(folder)
     pictures = {without_suffix(name) for name in names if name.lower().endswith(PICTURE_SUFFIXES)}
     found = [
@@ -224,7 +224,7 @@ def leave_out_missing(source: Path, found: list[tuple[T, str, Path | None]]) -> 
 
     `found` has a tuple for each photo: any object that belongs to it, its name, and its file or None. Returns the pairs (object, file) of
     the photos that have a file, and a list with one warning if any have none. `source` is the file or folder that names the photos. If
-    more than half are missing, it probably belongs to another capture, or was moved.
+    more than half are missing, `source` probably belongs to another capture, or was moved.
     """
     missing = [name for _, name, file in found if file is None]
     if 2 * len(missing) > len(found):

@@ -112,7 +112,7 @@ def _in_and_around(
 
 
 def _enough(points: np.ndarray, box: Box | None) -> bool:
-    """Tell whether at least 100 of the structure-from-motion points lie in the box, or are there at all if there is no box."""
+    """Tell whether there are at least 100 structure-from-motion points, in the box if there is one."""
     return len(points if box is None else points[box.contains(points)]) >= 100
 
 

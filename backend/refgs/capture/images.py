@@ -158,9 +158,9 @@ def read_image(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.n
     """Decode an image file to RGB (H, W, 3) uint8 and alpha (H, W) uint8, None without alpha.
 
     The image is turned upright by its EXIF orientation. Greyscale files and those with more than 8 bits are converted to 8-bit RGB.
-    Colours are converted to sRGB by the file's profile; with `is_data`, as for normals, codes stay as stored. `shrink` is 1, 2, 4 or 8: a
-    JPEG's sides are divided by it, after it is halved until both sides are divisible. A RAW photo's sides are halved at most, and other
-    formats are not reduced. Raises InputError naming the file if it is truncated or unreadable.
+    Colours are converted to sRGB by the file's profile; with `is_data`, as for normals, codes stay as stored. `shrink` is 1, 2, 4 or 8. A
+    JPEG's sides are divided by `shrink`, or by the largest smaller power of 2 that divides both. A RAW photo's sides are halved at most,
+    and other formats are not reduced. Raises InputError naming the file if it is truncated or unreadable.
     """
     image, alpha, white = read_codes(path, shrink, is_data)
     return as_bytes(image, white), alpha

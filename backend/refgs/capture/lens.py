@@ -32,8 +32,8 @@ class Lens:
     """Hold the lens of a photo: its intrinsics, the name of its model, and the model's coefficients.
 
     Focal lengths and principal point are in pixels; pixel centres are at half-integers. The model BROWN has the coefficients k1, k2, k3,
-    k4, p1, p2. Any other model is COLMAP's. Its coefficients are those that COLMAP lists after the principal point. They describe the photo
-    as stored; `turns` is the number of clockwise quarter turns from there to this photo.
+    k4, p1, p2. Any other model is COLMAP's. Its coefficients are those that COLMAP lists after the principal point. `turns` is the
+    number of clockwise quarter turns that the photo got after the coefficients were measured.
     """
 
     fx: float

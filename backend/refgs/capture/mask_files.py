@@ -76,6 +76,6 @@ def _match(files: Files, folder: Path, root: Path, photos: list[Path]) -> dict[P
 
 
 def _inner(root: Path, photo: Path) -> list[str]:
-    """Return two forms of a photo's path: relative to the folder `root`, and this without its first folder, such as `images`."""
+    """Return two forms of a photo's path: relative to the folder `root`, and the same without its first folder, such as `images`."""
     parts = photo.relative_to(root).parts if photo.is_relative_to(root) else photo.parts[-1:]
     return ["/".join(some) for some in (parts, parts[1:]) if some]

@@ -235,7 +235,7 @@ def _root(capture: Capture) -> Path:
 
 
 def _inner(view: View, root: Path) -> Path:
-    """Return a photo's path relative to `root`, without its first folder, such as `images`. Its mask has this path in `masks`."""
+    """Return a photo's path relative to `root`, without its first folder, such as `images`. A mask has its photo's path in `masks`."""
     if not view.image_path.is_relative_to(root):
         raise InputError(f"{view.image_path}: the photo is not in the capture's folder {root}. Move it there.")
     path = view.image_path.relative_to(root)

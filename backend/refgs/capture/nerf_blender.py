@@ -36,7 +36,7 @@ def read_nerf_blender(folder: Path) -> tuple[list[View], list[str]]:
 def published_normals(view: View, max_side: int | None = None) -> tuple[np.ndarray, np.ndarray] | None:
     """Read a view's true normals and its mask. Return None if the data set has no normals.
 
-    Normals (H, W, 3) are float32 unit vectors in the capture's world coordinates, zero where the mask is. The mask (H, W) is float32 in
+    Normals (H, W, 3) are float32 unit vectors in the capture's world coordinates, 0 where the mask is 0. The mask (H, W) is float32 in
     0..1, all 1 if the view has none. Both have the size to which `load_view` reduces the photo. Raises InputError naming the file.
     """
     if view.normal_path is None:

@@ -146,7 +146,7 @@ def _read(path: Path, channels: int) -> np.ndarray:
 
 
 def _read_array(path: Path, channels: int) -> np.ndarray:
-    """Read an array from a NumPy file as float32 (H, W, C). The file may also hold (C, H, W), or axes of length 1."""
+    """Read an array from a NumPy file as float32 (H, W, C). The file may also hold (C, H, W), or additional axes of length 1."""
     try:
         loaded = read_array(path, "Save it again.")
         values = loaded.astype(np.float32)

@@ -273,9 +273,8 @@ def _display_matrix(frame: av.VideoFrame) -> tuple[int, int, int, int]:
 def _sharpest(film: _Film, work: Path, count: int, report: Callable) -> tuple[int, list[_Candidate]]:
     """Find the sharpest frame in each of `count` equal stretches of time, and write it to the folder `work`.
 
-    Stretches without frames are skipped. `report` is called as by `extract_photos`.
-
-    Returns how many frames were read, and the candidates in the order of time.
+    Stretches without frames are skipped. `report` is called as by `extract_photos`. Returns how many frames were read, and the candidates
+    in the order of time.
     """
     length = film.length
     rate = float(film.stream.average_rate or 0)
@@ -327,7 +326,7 @@ def _sharp(candidates: list[_Candidate]) -> list[_Candidate]:
 
 
 def _choose(video: Path, frames: int, candidates: list[_Candidate]) -> tuple[list[_Candidate], int, int]:
-    """Leave out blurred candidates, and duplicates: candidates since whose predecessor the camera did not move.
+    """Leave out blurred candidates and duplicates. Before a duplicate, the camera has not moved since the last candidate that was kept.
 
     Returns the candidates that are left, the number of blurred ones and the number of duplicates. Raises InputError if fewer than
     MIN_PHOTOS are left. The error names `video` and the number of its `frames`.
