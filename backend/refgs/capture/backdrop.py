@@ -1,9 +1,9 @@
 """Find the plane that an object stands on or hangs on, and learn its colours, so that pixels of the plane can be told from the object's.
 
-The photos are warped onto the plane. Each texel gets the median of the photos that see it, because the object hides different texels in
-each photo. A pixel does not show the plane if its colour differs from the colour that its texel predicts. This works even where object and
-plane share colours. Shadows that stand still are part of the texture. Things that move, such as reflections in a shiny floor, differ
-between photos, so their texels are uncertain.
+The photos are warped onto the plane, which gives a texture of it. A texel is the median of the photos that see it, because the object hides
+different texels in each photo. A pixel does not show the plane if its colour differs from that of its texel. This works even where object
+and plane share colours. Shadows that stand still are part of the texture. Reflections in a shiny floor move from photo to photo, so texels
+that show them are uncertain.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ GRAZING = 0.15  # sine of the angle to the plane, below which a photo's pixels s
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """Hold the plane `normal` @ p = `distance`. The object is on the side where `normal` @ p is greater."""
+    """Hold a plane: the points p with `normal` @ p = `distance`. `normal` (3,) is a unit vector that points to the object's side."""
 
     normal: np.ndarray
     distance: float
@@ -48,8 +48,8 @@ def find_plane(
 ) -> Plane | None:
     """Find the plane that carries the object: a floor or a wall with many structure-from-motion points, and hardly any points behind it.
 
-    `centre` and `radius` are a ball around the object, and `up` is the world's up direction. `positions` (N, 3) are the cameras' positions.
-    If the plane is a wall, all cameras are in front of it. Return None if no plane is found.
+    `points` (M, 3) are from structure from motion. `centre` and `radius` are a ball around the object, and `up` (3,) is the world's up
+    direction. `positions` (N, 3) are the cameras' positions: a wall must have all of them in front of it. Return None if no plane is found.
     """
     near = points[np.linalg.norm(points - centre, axis=1) < 3 * radius]
     if len(near) < 50:
@@ -86,7 +86,7 @@ def find_plane(
 class Backdrop:
     """Hold the colours of a plane on a square grid of SIDE² texels around the object, and how much each colour differs between photos.
 
-    Colours are logarithms of 8-bit values, times STEPS. So a photo's exposure and white balance add one offset to each channel.
+    Colours are logarithms of 8-bit values, times STEPS. In this scale, a photo's exposure and white balance add a constant to each channel.
     """
 
     def __init__(self, plane: Plane, centre: np.ndarray, radius: float):
@@ -100,11 +100,14 @@ class Backdrop:
         self.to_world[3, 2] = 1
 
     def before(self, points: np.ndarray) -> np.ndarray:
-        """Tell which points (N, 3) lie in front of the plane, as bool (N,). Up to ABOVE · `radius` above it, points count as the plane."""
+        """Tell which points (N, 3) lie in front of the plane by more than ABOVE times `self.radius`. Returns bool (N,)."""
         return self.plane.height(points) > ABOVE * self.radius
 
     def learn(self, images: list[np.ndarray], cameras: list[Camera], hidden: list[np.ndarray]) -> None:
-        """Learn the plane's colours from photos (H, W, 3) uint8 RGB. `hidden` (H, W) is true for pixels that may show the object."""
+        """Learn the plane's colours from photos (H, W, 3) uint8 RGB.
+
+        `hidden` has a mask (H, W) for each photo, true at pixels that may show the object.
+        """
         stack = np.full((SIDE * SIDE, 3, len(images)), 255, np.uint8)
         bare = np.zeros((SIDE * SIDE, len(images)), bool)  # photos in which nothing may hide a texel
         for index, (image, camera, hide) in enumerate(zip(images, cameras, hidden, strict=True)):
@@ -134,13 +137,14 @@ class Backdrop:
     def likelihood(self, image: np.ndarray, camera: Camera, hidden: np.ndarray) -> np.ndarray:
         """Return how well each pixel's colour fits the bare plane, as float32 (H, W).
 
-        - Where the plane's colour is known: the probability, 0..1, that the plane's colour here lies in a box in Lab. The box is around the
-          pixel's colour, and BIN is its size.
-        - Where the plane's colour is not known, as below the object: −p, if the object is p times as likely there as the bare plane.
-        - Elsewhere, and where p is not known: NaN.
+        A pixel's value depends on the texel that it would show if nothing hid the plane:
 
-        `hidden` (H, W) is true for pixels that may show the object. The others give the photo's exposure and noise. If fewer than 200 of
-        them show the plane in a known colour, the result is NaN for all pixels.
+        - The texel's colour is known: the probability, 0..1, that the plane has the pixel's colour, within a box in Lab of size BIN.
+        - The colour is not known, but the odds of object to bare plane are, as below the object: these odds with a minus sign.
+        - Neither is known, or there is no texel: NaN.
+
+        `hidden` (H, W) is true at pixels that may show the object. The photo's exposure and noise are measured at the other pixels. If
+        fewer than 200 of those have a texel of known colour, all values are NaN.
         """
         texel, meets = self._pixels_on(camera)
         known = meets & (remap(self.known.astype(np.uint8), texel, cv2.INTER_NEAREST) > 0)
@@ -162,7 +166,10 @@ class Backdrop:
         return np.where(known, np.minimum(result, 1), np.where(meets, -odds, np.float32(np.nan)))
 
     def _pixels_on(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Find the texel that each pixel shows. Returns coordinates for `remap` (H, W, 2), and a mask (H, W) of pixels that show one."""
+        """Find the texel at which each pixel's ray meets the plane.
+
+        Returns the texel's coordinates for `remap` (H, W, 2), and a mask (H, W): true where there is such a texel.
+        """
         column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         ray = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones_like(row)], axis=-1)
         ray = ray @ camera.world_to_camera[:3, :3]
@@ -177,7 +184,7 @@ class Backdrop:
     def _texels_in(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Find the pixel that shows each texel. Returns pixel coordinates for `remap` (SIDE, SIDE, 2), and a mask (SIDE, SIDE).
 
-        The mask is false for texels that the photo does not show, or shows at an angle that is too grazing.
+        The mask is false for texels outside the picture, and for those that are seen at too grazing an angle.
         """
         column, row = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
         texel = np.stack([column, row, np.ones_like(row)], axis=-1)
@@ -197,9 +204,9 @@ def _median(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return each texel's median (N, 3) and spread (N, 3) over the photos, and each photo's exposure by channel (3, photos).
 
-    `stack` (N, 3, photos) holds the logarithms of the texels' values, and `used` (N, photos) is true where a photo's value counts.
-    The results are on the same scale. Spread is a standard deviation, estimated from the quartiles. Exposures are offsets, and are fitted
-    unless `offset` gives them.
+    `stack` (N, 3, photos) holds the logarithms of the texels' values, and `used` (N, photos) is true where a photo's value counts. All
+    results are logarithms, too. Spread is a standard deviation, estimated from the quartiles. A photo's exposure is how much its values
+    exceed the medians. Exposures are fitted, unless `offset` (3, photos) gives them.
     """
     count = used.sum(axis=1)
     values = np.where(used[:, None], stack, np.float32(np.nan))
@@ -224,5 +231,5 @@ def _logarithm(image: np.ndarray) -> np.ndarray:
 
 
 def _lab(image: np.ndarray) -> np.ndarray:
-    """Convert RGB, float32 0..255, to Lab, float32. L is scaled to 0..255, as in 8-bit Lab; a and b are as they are."""
+    """Convert RGB, float32 0..255, to Lab, float32. L is scaled to 0..255, as in 8-bit Lab; a and b are not scaled."""
     return cv2.cvtColor(image / 255, cv2.COLOR_RGB2LAB) * np.array([2.55, 1, 1], np.float32)

@@ -11,14 +11,14 @@ from refgs.settings import RegionSettings
 class Box:
     """Hold a box with any position, size and rotation.
 
-    `matrix` (4, 4) maps the cube from −1 to 1 onto the box. Its columns are half of each edge as a vector, then the centre.
+    `matrix` (4, 4) maps the cube from −1 to 1 onto the box. Its first three columns are half of the edge vectors, its last is the centre.
     """
 
     matrix: np.ndarray
 
     @classmethod
     def of(cls, region: RegionSettings) -> "Box":
-        """Make a box with the centre, edge lengths and rotation of the settings [region]."""
+        """Make a box from the settings' section [region]: centre, edge lengths, and rotation (XYZ Euler angles in degrees)."""
         from scipy.spatial.transform import Rotation  # slow to import, and few captures have a region
 
         turn = Rotation.from_euler("xyz", region.rotation, degrees=True).as_matrix()
@@ -27,7 +27,7 @@ class Box:
         return cls(matrix)
 
     def moved(self, to_frame: np.ndarray) -> "Box":
-        """Return the box in other world coordinates: p_new = to_frame @ p_old."""
+        """Return the box in other world coordinates: p_new = to_frame @ p_old. `to_frame` is (4, 4)."""
         return Box(to_frame @ self.matrix)
 
     @property

@@ -1,7 +1,7 @@
-"""Load a capture's photos for training. Large captures are cached: photos are mapped from files, so that the system can free their memory.
+"""Load a capture's photos for training. To save memory, photos of a large capture are cached as NumPy files and memory-mapped.
 
-A photo's files are named by a hash of all that its pixels depend on. A resumed training reuses files whose names are still right, and
-writes the others again.
+A photo's cache files are named by a hash of all that its pixels depend on. A resumed training reuses the files whose hash is unchanged, and
+writes new ones for the other photos.
 """
 
 import hashlib
@@ -26,8 +26,8 @@ LARGE = 500e6  # bytes of all photos of a capture, from which on they are cached
 def load_views(views: list[View], max_side: int, folder: Path) -> list[LoadedView]:
     """Load photos for training as `load_view` does. If they take more than LARGE bytes, cache them in `folder`.
 
-    The arrays of a cached photo are mapped from files. Changes of their values stay in memory until `release_memory` is called. If the disk
-    is full, photos are held in memory. Raises InputError naming the photo that cannot be read.
+    The arrays of a cached photo are memory-mapped. Writing to them does not change the files, and is undone by `release_memory`. If the
+    disk is full, photos are held in memory. Raises InputError naming the photo that cannot be read.
     """
     cameras = [view.camera.fitted(max_side) for view in views]
     if sum(4 * camera.width * camera.height for camera in cameras) <= LARGE:
@@ -49,7 +49,7 @@ def load_views(views: list[View], max_side: int, folder: Path) -> list[LoadedVie
 def reduced_views(views: list[LoadedView], factor: int, folder: Path) -> list[LoadedView]:
     """Reduce the sides of loaded photos by a factor, in linear light as `load_view` does. If `folder` exists, cache the results in it.
 
-    If photos are mapped, only one at a time is in memory.
+    If the photos are memory-mapped, only one at a time takes memory.
     """
     found = []
     for number, view in enumerate(views):
@@ -62,7 +62,7 @@ def reduced_views(views: list[LoadedView], factor: int, folder: Path) -> list[Lo
 
 
 def release_memory(views: list[LoadedView]) -> None:
-    """Free the memory of mapped photos, on Linux. When they are used again, they are mapped anew from the system's file cache."""
+    """Free the memory of memory-mapped photos, on Linux only. Their next use reads the files again; changed pixels are lost."""
     if not hasattr(mmap, "MADV_DONTNEED") or sys.platform != "linux":
         return
     for view in views:
@@ -88,7 +88,7 @@ def _name(view: View, max_side: int) -> str:
 
 
 def _read(camera: Camera, folder: Path, name: str) -> LoadedView | None:
-    """Map the files of a cached photo, whose camera is `camera`. Return None if there are none, or if they are damaged."""
+    """Memory-map the cache files of a photo with this camera. Return None if there are no such files, or if they are damaged."""
     image = next(folder.glob(f"{name}.image.*.npy"), None)
     if image is None:
         return None
@@ -102,7 +102,7 @@ def _read(camera: Camera, folder: Path, name: str) -> LoadedView | None:
 
 
 def _mapped(file: Path, shape: tuple[int, ...], *kinds: type) -> np.ndarray:
-    """Map an array from a file. Raises an exception of any type if the file is damaged, or has another shape, or a dtype not in `kinds`."""
+    """Memory-map an array of this shape, with a dtype in `kinds`. Raises an exception of any type if the file does not hold one."""
     check_file(file)
     values = np.asarray(np.load(file, mmap_mode="c"))  # not "r", as torch warns of arrays that it must not write
     if values.shape != shape or values.dtype not in kinds:
@@ -111,7 +111,7 @@ def _mapped(file: Path, shape: tuple[int, ...], *kinds: type) -> np.ndarray:
 
 
 def _cached(view: LoadedView, folder: Path, name: str) -> LoadedView:
-    """Write a photo's files and map them. Return `view` itself if they cannot be written."""
+    """Write a photo's cache files, and return the photo memory-mapped from them. Return `view` itself if they cannot be written."""
     try:
         _write(view, folder, name)
     except OSError:
@@ -120,7 +120,7 @@ def _cached(view: LoadedView, folder: Path, name: str) -> LoadedView:
 
 
 def _write(view: LoadedView, folder: Path, name: str) -> None:
-    """Write a photo's files. The image comes last: if it is there, the photo is complete."""
+    """Write a photo's cache files. The image is written last: if it exists, the photo is complete. Raises OSError if the disk is full."""
     if shutil.disk_usage(folder).free < 2 * view.image.nbytes:
         raise OSError
     files = [(f"{name}.image.{view.white}.npy", view.image)]

@@ -45,13 +45,12 @@ def write_cameras(
     exposures: dict[str, list[float]] | None = None,
     refined: bool = False,
 ) -> None:
-    """Write the run folder's cameras.json: the undistorted cameras in the run's frame, with OpenGL axes.
+    """Write the run folder's cameras.json: undistorted cameras with OpenGL axes, in the run's frame (the world coordinates of training).
 
-    `light` is "world" if the light stands still, or "camera" if it turns with the camera, as on a turntable. In the second case
-    environment.exr shows the light at the first training photo, and the key `light_of` names that photo. `exposures` maps names of training
-    photos to factors of red, green and blue: the scene's radiance times these factors gives the photo's. If the three are equal, one is
-    written.
-    `refined` tells that the training photos' poses were refined: a training view then has the key `refined`.
+    `light` is "world" if the light stands still, or "camera" if it turns with the camera, as on a turntable. In the second case the light
+    in environment.exr is that of the first training photo, and the key `light_of` names that photo. `exposures` maps a training photo's
+    name to three factors, for red, green and blue: the photo's radiance is the scene's times these factors. If the three are equal, only
+    one is written. `refined` tells whether training refined the poses: each training view then has the key `refined`.
     """
     frames = []
     for view in capture.views:
@@ -88,9 +87,15 @@ def _from(folder: Path, file: Path) -> Path:
 def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, list[float | list[float]], bool]:
     """Read a run folder's cameras.json.
 
-    Return the cameras in the run's frame, the split of each ("train" or "test"), the similarity transform (4, 4) from the run's frame to
-    the capture's, the exposure of each, and whether the training refined poses. An exposure is one factor, or one for each of red, green
-    and blue (1 if the file has none).
+    Returns five values:
+
+    - the cameras in the run's frame (the world coordinates of training)
+    - the split of each camera, "train" or "test"
+    - the similarity transform (4, 4) from the run's frame to the capture's coordinates
+    - the exposure of each camera: one factor, or one for each of red, green and blue; 1 if the file gives none
+    - whether training refined the poses
+
+    Raises InputError.
     """
     file = Path(file)
     found = read_run_transforms(file)

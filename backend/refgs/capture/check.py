@@ -34,11 +34,11 @@ LAYOUTS = {
 
 
 def check(capture: Capture, out: Path) -> dict[str, Any]:
-    """Check a capture. Write cameras.json, and thumbnails of up to 12 photos, so that another program can display the capture.
+    """Describe a capture in text with warnings. Write cameras.json and up to 12 thumbnails for a program that displays the capture.
 
     These files are written to the folder `out`, over those of an earlier check. Returns a dict: the paths `capture`, `cameras` and
-    `thumbnails`; `centre` and `radius` of the region of interest, in the coordinates of cameras.json; and `lines`, the text from
-    `describe`. Raises InputError if a photo or mask cannot be read.
+    `thumbnails`; `centre` and `radius` of the region of interest (a ball), in the coordinates of cameras.json; and `lines`, the text from
+    `describe`. Raises InputError if a photo, mask or prior cannot be read.
     """
     out.mkdir(parents=True, exist_ok=True)
     lines = describe(capture, out)
@@ -56,8 +56,9 @@ def check(capture: Capture, out: Path) -> dict[str, Any]:
 def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
     """Describe a capture in lines of text. At the end there are lines `Not used: …` and `Warning: …` for likely mistakes.
 
-    Decodes every photo, mask and prior. Raises InputError if some of these files cannot be read: the message says how many, and names the
-    first. If the folder `thumbnails` is given, thumbnails of up to 12 photos are written to it.
+    Decodes every photo, mask and prior (normals or depth that another program guessed). Raises InputError if some of these files cannot be
+    read: the message says for how many views, and names the first file. If the folder `thumbnails` is given, thumbnails of up to 12 photos
+    are written to it.
     """
     statistics = _decode_all(capture, thumbnails)
     return [
@@ -178,7 +179,7 @@ def _masks(capture: Capture, statistics: list[_Statistics]) -> str:
 
 
 def _priors(capture: Capture) -> list[str]:
-    """Report for how many photos there are normals and depth from other programs. Return no line if there are none."""
+    """Report how many training photos have normals, and how many have depth, from other programs. Return a line for each, none for 0."""
     lines = []
     for name, field in FOLDERS.items():
         if count := sum(getattr(view, field) is not None for view in capture.train_views):
@@ -187,9 +188,10 @@ def _priors(capture: Capture) -> list[str]:
 
 
 def _guessed_object(capture: Capture) -> list[str]:
-    """Report the box in which a training without masks looks for the object, as a list of one line.
+    """Report the box in which a training would look for the object to make masks, as a list of one line.
 
-    Return [] if a photo has a mask, if the user has set a box, or if a training cannot make masks of this capture.
+    Return [] if a training would make no masks: if a photo has a mask, if the layout stores masks in the photos, or if the cameras look
+    outwards. Also return [] if the user has set a box.
     """
     if any(view.masked for view in capture.views) or capture.layout in Z_UP or capture.box is not None:
         return []

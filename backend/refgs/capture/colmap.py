@@ -1,7 +1,8 @@
-"""Read COLMAP captures: a sparse model in one of _MODELS, binary or text, with photos in `images`, `input` or the capture's folder.
+"""Read COLMAP captures: a sparse model, binary or text, with photos in `images`, `input` or the capture's folder.
 
-Some data sets, such as the real scenes of Ref-NeRF and mip-NeRF 360, also have reduced photos in `images_2`, `images_4` and `images_8`. To
-use them, pass the path of such a folder as the capture's. Reduced photos may have another file suffix than the photos that the model names.
+The model is in one of the folders _MODELS. Some data sets, such as the real scenes of Ref-NeRF and mip-NeRF 360, also have reduced photos
+in `images_2`, `images_4` and `images_8`. To use reduced photos, pass the path of their folder in place of the capture's. They may have
+another file suffix than the photos that the model names.
 """
 
 import re
@@ -45,11 +46,10 @@ class Model(NamedTuple):
 
 
 def find_model(folder: Path) -> Model | None:
-    """Find the COLMAP models of a capture. Return the one with the most photos, or None if there is none.
+    """Find a capture's COLMAP model. If there are several, return the one with the most photos. Return None if there is none.
 
-    If several models have equally many photos, return the one whose folder comes first in _MODELS.
-
-    `folder` is the capture's folder, or its subfolder `images_N` with reduced photos.
+    Of models with equally many photos, the one whose folder comes first in _MODELS is returned. `folder` is the capture's folder, or its
+    subfolder `images_N` with reduced photos.
     """
     reduced = re.fullmatch(r"images_\d+", folder.name) is not None
     top = folder.parent if reduced else folder
@@ -77,7 +77,7 @@ _MODELS = (
 
 
 def _sorted(top: Path, pattern: str) -> list[Path]:
-    """Return the folders that match a pattern, `sparse/2` before `sparse/10`."""
+    """Return the folders below `top` that match a glob pattern, sorted as numbers are: `sparse/2` before `sparse/10`."""
     if pattern == ".":
         return [top]
     # A folder `colmap` with photos is a capture of its own, in a folder of captures.
@@ -132,7 +132,10 @@ def read_colmap(model: Model) -> tuple[list[View], np.ndarray | None, np.ndarray
 
 
 def _passed_over(model: Model, count: int) -> list[str]:
-    """Say in one line which models are not used. Return [] if there is only one. `count` is the number of photos of the model in use."""
+    """Return a list with one line about the models that are not used, or [] if there is no other model than `model`.
+
+    `count` is the number of photos of `model`.
+    """
     if not model.others:
         return []
     other, photos = model.others[0]
@@ -142,13 +145,16 @@ def _passed_over(model: Model, count: int) -> list[str]:
 
 
 def _find(photos: Files, name: str) -> Path | None:
-    """Find a photo by its name in a model. COLMAP may have been run on the folder above that of the photos, such as `images`."""
+    """Find a photo by the name that the model gives it. Return None if it is missing.
+
+    If COLMAP was run on the folder above that of the photos, the name begins with a folder `images` or `input`. This is dropped if needed.
+    """
     first, _, rest = name.replace("\\", "/").partition("/")
     return photos.find(name) or (photos.find(rest) if fold(first) in PHOTO_FOLDERS else None)
 
 
 def capture_root(folder: Path, layout: str) -> Path:
-    """Return the folder that holds the folder `masks` of a capture. `folder` is the capture's, `layout` its layout, such as "colmap"."""
+    """Return the folder in which a capture's folder `masks` is. `folder` is the capture's folder, `layout` its layout, such as "colmap"."""
     model = find_model(folder) if layout == "colmap" else None
     return folder if model is None else model.root
 

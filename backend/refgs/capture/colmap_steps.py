@@ -35,11 +35,11 @@ INSIDE_FEATURES = (
 
 
 def choose_pairs(database: Path) -> list[tuple[int, int]]:
-    """Choose which photos in COLMAP's database to match. Returns pairs of photo indices. Photos are sorted by name.
+    """Choose which photos in COLMAP's database to match. Returns pairs of photo indices, which follow the order of the file names.
 
     With up to ALL_PAIRS photos, every pair is matched. With more, each photo is matched with two groups:
 
-    - The next NEXT photos. In a video, or a walk around the object, they were taken nearby.
+    - The NEXT photos that follow it. In a video, or a walk around the object, they were taken nearby.
     - Some photos that look similar. They link several walks around the object. They also help if the file names do not follow the
       camera's path.
     """
@@ -58,10 +58,11 @@ def choose_pairs(database: Path) -> list[tuple[int, int]]:
 
 
 def extract_features(photos: list[Path], masks: list[Path], database: Path, progress: Callable) -> None:
-    """Extract image features of all photos into COLMAP's database. If there are masks, only features inside them are kept.
+    """Extract image features of all photos into COLMAP's database. If `masks` is not empty, keep only features inside the masks.
 
-    Photos with the same size and focal length (EXIF) share their intrinsics. COLMAP gets a temporary JPEG of a photo that it cannot read.
-    At the end the photos in the database are renamed to their indices, because names in COLMAP's file of pairs cannot have spaces.
+    `masks` has a mask file for each photo, in the same order, or is empty. `progress("features", done, total)` is called for each batch of
+    photos. Photos with the same size and focal length (EXIF) share their intrinsics. COLMAP gets a temporary JPEG of a photo that it cannot
+    read. At the end the photos in the database are renamed to their indices, because names in COLMAP's file of pairs cannot have spaces.
     """
     import pycolmap
 
@@ -120,7 +121,7 @@ def extract_features(photos: list[Path], masks: list[Path], database: Path, prog
 
 
 def _simplify(camera) -> None:
-    """Give a camera (pycolmap.Camera) the model FEW_CAMERA_MODEL. Its focal length stays."""
+    """Give a camera (pycolmap.Camera) with few photos the simpler model FEW_CAMERA_MODEL. Its focal length stays."""
     import pycolmap
 
     focal = camera.mean_focal_length()
@@ -144,7 +145,10 @@ def _lens(camera) -> tuple[int, int, float]:
 
 
 def match_features(database: Path, progress: Callable) -> None:
-    """Match the features of the photos in the pairs that `choose_pairs` chooses. Store the matches in COLMAP's database."""
+    """Match features within each pair of photos from `choose_pairs`. Store the matches in COLMAP's database.
+
+    `progress("matching", done, total)` is called for every 100 pairs.
+    """
     import pycolmap
 
     verification = pycolmap.TwoViewGeometryOptions()
@@ -163,7 +167,8 @@ def match_features(database: Path, progress: Callable) -> None:
 def map_one_by_one(photos: list[Path], database: Path, progress: Callable) -> list[Any]:
     """Compute cameras from the feature matches, one photo after the other.
 
-    COLMAP may return several models that share few photos or none. Return them (pycolmap.Reconstruction), the one with most photos first.
+    Returns COLMAP's models (pycolmap.Reconstruction), the one with most photos first. If some photos could not be linked to the others,
+    there are several, which share few photos or none. `progress("mapping", done, total)` is called for each photo.
     """
     import pycolmap
 
@@ -210,7 +215,7 @@ def map_at_once(photos: list[Path], database: Path) -> list[Any]:
 
 
 def _tied(model: Any) -> set[int]:
-    """Return the numbers of a model's images that are tied together by common points.
+    """Return the image IDs of a model's images that are tied together by common points.
 
     The first two tied images are those that share most points. Another image is tied if it shows at least TIED points, each of which at
     least two tied images show. The distance of an image that is not tied is unknown, because the relative pose of two photos has no scale.
@@ -237,7 +242,7 @@ def epipolar_distance(ours: np.ndarray, theirs: np.ndarray, pose: np.ndarray) ->
     """Return the Sampson distance (M,) of each match: how far two matched points are from each other's epipolar lines.
 
     `ours` and `theirs` (M, 2) are the matched points in the two photos, on the image plane at depth 1. `pose` (3, 4) maps points from the
-    first camera's coordinates to the second's.
+    first camera's coordinates to the second's. Multiply the result by the focal length to get pixels.
     """
     turn, shift = pose[:, :3], pose[:, 3]
     x, y = (np.column_stack([rays, np.ones(len(rays))]) for rays in (ours, theirs))
@@ -251,8 +256,8 @@ def unexplained_part(model: Any, database: Path) -> float:
     """Return the fraction of feature matches that the cameras of a model (a pycolmap.Reconstruction) do not explain.
 
     A match is explained if both its photos have cameras, and its points are at most MATCH_TOLERANCE pixels from their epipolar lines.
-    Matches of photos without cameras count as unexplained. If an object turns in a room that stands still, cameras may be found for the
-    photos that agree with the object's motion, but not for those that agree with the room's.
+    Matches of photos without cameras count as unexplained, to detect an object that turns in a room that stands still. COLMAP may then find
+    cameras only for photos whose matches follow the object, and none for photos whose matches follow the room.
     """
     import pycolmap
 
@@ -281,7 +286,7 @@ def unexplained_part(model: Any, database: Path) -> float:
 def color_points(model: Any, photos: list[Path]) -> None:
     """Give each point of a model (a pycolmap.Reconstruction) the mean sRGB colour of the pixels that it was seen at.
 
-    The images in the model are named by the photos' indices. COLMAP does the same, but not for HEIC.
+    The name of an image in the model is the index of its photo in `photos`. COLMAP can colour points itself, but does not read HEIC.
     """
     sums = {number: np.zeros(4) for number in model.points3D}  # red, green, blue, count
     for number in model.reg_image_ids():

@@ -1,4 +1,4 @@
-"""Convert photos from the colours that their files declare to sRGB codes with Rec.709 primaries.
+"""Convert a photo's codes (encoded pixel values) from the colour space that its file declares to sRGB, which has Rec.709 primaries.
 
 A file declares its colours by an ICC profile, by code points of ITU-T H.273 (PNG's cICP, nclx of HEIC and AVIF), by PNG's gAMA and cHRM,
 or by the EXIF of a camera that is set to Adobe RGB. Colours beyond Rec.709 are clipped.
@@ -53,13 +53,13 @@ _ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06)  # primaries; its gamma is 563
 
 
 def _pq(codes: np.ndarray) -> np.ndarray:
-    """Return radiance for codes of PQ (SMPTE ST 2084). 1 is 203 cd/m², the white of diffuse surfaces by ITU-R BT.2408."""
+    """Decode PQ codes in 0..1 (SMPTE ST 2084) to radiance. Radiance 1 is 203 cd/m², the white of diffuse surfaces by ITU-R BT.2408."""
     root = codes ** (32 / 2523)
     return 10_000 / 203 * (np.maximum(root - 107 / 128, 0) / (2413 / 128 - 2392 / 128 * root)) ** (16384 / 2610)
 
 
 def _hlg(codes: np.ndarray) -> np.ndarray:
-    """Return the scene's radiance for codes of HLG (ITU-R BT.2100). 1 is at the code 0.75, the white of diffuse surfaces by BT.2408."""
+    """Decode HLG codes in 0..1 (ITU-R BT.2100) to scene radiance. Code 0.75 has radiance 1, the white of diffuse surfaces by BT.2408."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
 
     def scene(codes):
@@ -86,14 +86,15 @@ _HDR = (16, 18)
 
 
 class Unusable(Exception):
-    """Tell why a profile cannot be used."""
+    """Error for a colour profile that cannot be used. Its message says why."""
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Hold how codes become linear Rec.709: the three channels' curves, then a matrix (3, 3).
+    """Hold a colour profile: a curve for each channel, then a matrix (3, 3) to linear Rec.709.
 
-    With `hdr`, radiance may exceed white's. With `grey`, the profile is for greyscale pictures.
+    A curve maps codes in 0..1 to linear values. With `hdr`, radiance may exceed that of white. With `grey`, the profile is for greyscale
+    pictures.
     """
 
     curves: tuple[Curve, ...]
@@ -103,12 +104,15 @@ class Profile:
 
     @cached_property
     def is_srgb(self) -> bool:
-        """Return if codes of this profile are those of sRGB, or nearly so: then they stay as they are."""
+        """Tell whether the profile is that of sRGB, or nearly so. Codes then need no conversion."""
         differences = srgb_encode(_table(self, 256)) - np.linspace(0, 1, 256)[:, None]
         return bool(np.abs(self.matrix - np.eye(3)).max() < SAME_MATRIX and np.abs(differences).max() < SAME_CODE / 255)
 
     def to_srgb(self, image: np.ndarray) -> tuple[np.ndarray, int]:
-        """Convert codes (H, W, 3), uint8 or uint16, to sRGB codes. Return them and the code of white. `image` is overwritten."""
+        """Convert codes (H, W, 3), uint8 or uint16, to sRGB codes. Return these and the code of white. `image` is overwritten.
+
+        The result has the dtype of `image`, or uint16 if `hdr` is true.
+        """
         largest = np.iinfo(image.dtype).max
         table, matrix = _table(self, largest + 1), self.matrix.astype(np.float32)
         white = HDR_WHITE if self.hdr else largest
@@ -129,7 +133,7 @@ class Profile:
 
 @dataclass(frozen=True, eq=False)
 class LookUp:
-    """Hold a profile that is made of tables, such as those of CMYK. LittleCMS converts pictures of the mode `mode`, 8-bit."""
+    """Hold a colour profile made of look-up tables, as for CMYK. LittleCMS applies it to 8-bit pictures of Pillow's mode `mode`."""
 
     profile: ImageCms.ImageCmsProfile
     mode: str
@@ -143,18 +147,24 @@ class LookUp:
 def declared_profile(picture: Image.Image, path: Path) -> Profile | LookUp | None:
     """Return the profile of an opened picture's colours. Return None if the file declares none, or sRGB.
 
-    A profile that cannot be used is ignored with an InputWarning, the first time that it is met.
+    Also return None for a profile that cannot be used. An InputWarning says why, once for each reason.
     """
     return _usable(lambda: _of_picture(picture, path), path)
 
 
 def coded_profile(primaries: int, transfer: int, path: Path) -> Profile | None:
-    """Return the profile of code points of H.273 in the file `path`. Return None for those of sRGB, and for unknown ones, as above."""
+    """Return the profile for two code points of H.273: of the colour primaries and of the transfer curve. Return None for those of sRGB.
+
+    Also return None for unknown code points. An InputWarning then names the file `path`, once for each reason.
+    """
     return _usable(lambda: _of_code_points(primaries, transfer), path)
 
 
 def _usable(find: Callable[[], Found], path: Path) -> Found | None:
-    """Return what `find` finds. Return None if it is sRGB, or if it cannot be used, of which the first is told."""
+    """Return the profile that `find()` returns, or None if that is sRGB.
+
+    If `find` raises Unusable, return None. An InputWarning then names the file `path`, once for each reason.
+    """
     try:
         found = find()
     except Unusable as error:
@@ -172,7 +182,7 @@ def _of_picture(picture: Image.Image, path: Path) -> Profile | LookUp | None:
 
 
 def _of_tags(picture: Image.Image, path: Path) -> Profile | None:
-    """Return the profile of a picture without an ICC profile."""
+    """Return the profile that a picture without an ICC profile declares by other tags, or None. Raises Unusable."""
     info = picture.info
     if picture.format == "PNG":
         if points := _png_code_points(path):
@@ -198,9 +208,10 @@ def _of_code_points(primaries: int, transfer: int) -> Profile:
 
 @lru_cache(32)
 def _of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Profile:
-    """Return the profile of a PNG's gAMA and cHRM, which begins with white.
+    """Return the profile of a PNG's gAMA (`gamma`) and cHRM (`chromaticities`: x and y of white, red, green and blue).
 
-    A gamma of 0.45455 stands for sRGB, as the PNG specification lets encoders write it.
+    A gamma of 0.45455 stands for sRGB's curve, because the PNG specification lets encoders write this number for sRGB. So does None. None
+    for `chromaticities` stands for Rec.709. Raises Unusable.
     """
     curve = srgb_decode if not gamma or abs(gamma - 0.45455) < 5e-5 else _power(1 / gamma)  # Adobe RGB has 0.45471
     white, primaries = (chromaticities[:2], chromaticities[2:]) if chromaticities else ((), ())
@@ -211,7 +222,7 @@ def _of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> 
 
 
 def _is_adobe_rgb(picture: Image.Image) -> bool:
-    """Return if the EXIF is that of a camera set to Adobe RGB (DCF 2.0, 5.1). Not all such cameras embed a profile."""
+    """Tell whether a picture's EXIF says that the camera was set to Adobe RGB (DCF 2.0, 5.1). Not all such cameras embed a profile."""
     try:
         exif = Image.Image.getexif(picture)
         return exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == "R03"
@@ -220,7 +231,7 @@ def _is_adobe_rgb(picture: Image.Image) -> bool:
 
 
 def _png_code_points(path: Path) -> tuple[int, int] | None:
-    """Return the primaries and the transfer of a PNG's chunk cICP (PNG specification, 11.3.2.6). Pillow does not read it."""
+    """Return the code points (primaries, transfer) of a PNG's chunk cICP (PNG specification, 11.3.2.6), or None. Pillow skips it."""
     with open_file(path) as file:
         for name, _ in png_chunks(file):
             if name == b"cICP":
@@ -232,7 +243,10 @@ def _png_code_points(path: Path) -> tuple[int, int] | None:
 
 
 def _avif_code_points(path: Path) -> tuple[int, int] | None:
-    """Return the primaries and the transfer of an AVIF's primary item, from its box colr (ISO/IEC 14496-12, 12.1.5). Pillow does not."""
+    """Return the code points (primaries, transfer) of an AVIF's primary item, or None. Pillow does not read them.
+
+    They are in the item's box colr (ISO/IEC 14496-12, 12.1.5).
+    """
     try:
         meta = next(body for kind, body in _boxes(path.read_bytes()) if kind == b"meta")[4:]
         inside = dict(_boxes(meta))
@@ -249,7 +263,7 @@ def _avif_code_points(path: Path) -> tuple[int, int] | None:
 
 
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the kind and the contents of each box (ISO/IEC 14496-12, 4.2)."""
+    """Yield the type (4 bytes) and the contents of each box in `data` (ISO/IEC 14496-12, 4.2)."""
     at = 0
     while at + 8 <= len(data):
         size, kind, start = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8], at + 8
@@ -263,7 +277,7 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _associated(ipma: bytes, item: int) -> list[int]:
-    """Return the numbers of an item's properties, from the box ipma (ISO/IEC 23008-12, 9.3.2)."""
+    """Return which properties belong to an item, by the box ipma (ISO/IEC 23008-12, 9.3.2). They are numbers, counted from 1."""
     version, wide, count, at = ipma[0], ipma[3] & 1, int.from_bytes(ipma[4:8], "big"), 8
     for _ in range(count):
         size = 2 if version < 1 else 4
@@ -277,7 +291,7 @@ def _associated(ipma: bytes, item: int) -> list[int]:
 
 
 def _of_icc(data: bytes) -> Profile | LookUp:
-    """Return an ICC profile as curves and a matrix, or as LittleCMS's tables if it is made of such. Raises Unusable."""
+    """Parse an ICC profile. Return a LookUp if it is made of tables, otherwise a Profile. Raises Unusable."""
     found = _parsed(data)
     if isinstance(found, str):
         raise Unusable(found)
@@ -286,7 +300,7 @@ def _of_icc(data: bytes) -> Profile | LookUp:
 
 @lru_cache(32)
 def _parsed(data: bytes) -> Profile | LookUp | str:
-    """Parse an ICC profile (ICC.1:2022). Return why it cannot be used, if it cannot."""
+    """Parse an ICC profile (ICC.1:2022). If it cannot be used, return the reason as text."""
     try:
         if data[36:40] != b"acsp":
             return "it is broken"
@@ -340,7 +354,7 @@ def _curve(tag: bytes) -> Curve:
 
 
 def _check_mode(profile: Profile | LookUp, mode: str) -> None:
-    """Raise Unusable if a profile is not for pictures of this mode."""
+    """Raise Unusable if a profile is not for pictures of this Pillow mode, such as "RGB"."""
     if isinstance(profile, Profile) and profile.grey:
         if mode[0] not in "1LI":
             raise Unusable("it is for greyscale pictures")
@@ -350,7 +364,7 @@ def _check_mode(profile: Profile | LookUp, mode: str) -> None:
 
 @lru_cache(32)
 def _table(profile: Profile, size: int) -> np.ndarray:
-    """Return the linear values of all codes, float32 (size, 3)."""
+    """Return the linear values of the codes 0 to `size` − 1 by the curves of a profile's three channels, float32 (size, 3)."""
     codes = np.arange(size) / (size - 1)
     with np.errstate(all="ignore"):  # a broken profile's numbers
         values = np.stack([curve(codes) for curve in profile.curves], axis=1)

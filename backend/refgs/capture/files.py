@@ -1,4 +1,4 @@
-"""Find the photos of a capture on disk by the names that its files give them, and combine each photo with its camera in a View."""
+"""Find the photos of a capture on disk by the names in its camera files, and combine each photo with its camera in a View."""
 
 import os
 import posixpath
@@ -29,7 +29,7 @@ _MASK_WORDS = re.compile(r"(?:mask|alpha|matte)[-_. ](?P<after>.+)|(?P<before>.+
 
 
 def is_image(name: str) -> bool:
-    """Tell by its suffix whether a file is an image. macOS leaves files ._NAME.jpg that are none."""
+    """Tell by its name whether a file is an image. Hidden files, such as the ._NAME.jpg that macOS writes, do not count."""
     return not name.startswith(".") and os.path.splitext(name)[1].lower() in _RANKS
 
 
@@ -39,7 +39,7 @@ def fold(name: str) -> str:
 
 
 def without_suffix(name: str) -> str:
-    """Return a file name or path without its image suffix. Other dots stay: `render.0001` has none."""
+    """Return a file name or path without its image suffix. Other endings stay: `render.0001` is returned unchanged."""
     stem, suffix = os.path.splitext(name)
     return stem if suffix.lower() in _RANKS else name
 
@@ -66,7 +66,7 @@ class Files:
     """Find a capture's files by the names that the capture gives them. Each folder is listed only once.
 
     A name may differ from the file's: in letter case, in Unicode's form, by `\\` for `/`, or by a missing or other image suffix. It may
-    also be an absolute path on another machine. Whatever name led to a file, its path is the same.
+    also be an absolute path on another machine. All names of the same file lead to the same path. `folder` is the capture's.
     """
 
     def __init__(self, folder: Path):
@@ -78,9 +78,9 @@ class Files:
     def find(self, name: str, *homes: str, suffixes: bool = True) -> Path | None:
         """Return the file called `name`, a path relative to the capture's folder or an absolute path. Return None if it is missing.
 
-        `homes` are folders, such as "images", in which the name is looked for next. If an absolute path does not exist, its first folders
-        are dropped one by one, and the rest is looked for in the capture's folder. At last the bare file name is looked for in `homes`. If
-        `suffixes` is false, a file with another suffix than the name's is not returned.
+        A relative path is looked for in the capture's folder, then in its subfolders `homes`, such as "images". An absolute path that does
+        not exist is shortened: its first folders are dropped one by one, and what remains is looked for in the capture's folder. At last
+        the bare file name is looked for in `homes`. If `suffixes` is false, a file with another suffix than that of `name` is not returned.
         """
         for folder, last in self._places(name, homes):
             if (file := self._pick(folder, last, suffixes)) is not None:
@@ -88,14 +88,14 @@ class Files:
         return None
 
     def find_folder(self, *parts: str) -> Path | None:
-        """Return a folder inside the capture's by its path, whatever its letter case. Return None if there is none."""
+        """Return the folder at the path `parts` below the capture's folder, in any letter case. Return None if there is none."""
         if parts not in self._folders:
             above = self.find_folder(*parts[:-1])
             self._folders[parts] = None if above is None else self.folder_in(above, parts[-1])
         return self._folders[parts]
 
     def folder_in(self, above: Path, name: str) -> Path | None:
-        """Return the folder of that name in another folder, whatever its letter case. Return None if there is none."""
+        """Return the folder `name`, in any letter case, that is in the folder `above`. Return None if there is none."""
         names = self._list(above).folders.get(fold(name), [])
         return above / (name if name in names else min(names)) if names else None
 
@@ -104,7 +104,7 @@ class Files:
         return sorted(name for names in self._list(folder).files.values() for name in names if is_image(name))
 
     def all_images(self, folder: Path) -> Iterator[Path]:
-        """Yield the images in a folder and the folders in it, sorted within each. Hidden ones are left out."""
+        """Yield the images in a folder, then those in its subfolders, sorted in each folder. Leave out hidden files and folders."""
         yield from (folder / name for name in self.images(folder))
         for inner in self.folders(folder):
             yield from self.all_images(inner)
@@ -145,7 +145,7 @@ class Files:
                 yield folder, parts[-1]
 
     def _own(self, folder: Path) -> Path:
-        """If a folder lies in the capture's, also by a link, return its path below `self.folder`. Otherwise return it unchanged."""
+        """Return a folder's path below `self.folder` if it lies there after links are resolved. Otherwise return it unchanged."""
         if folder not in self._owned:
             real, top = os.path.realpath(folder), os.path.realpath(self.folder)
             inside = real == top or real.startswith(os.path.join(top, ""))
@@ -207,7 +207,7 @@ def find_photos(folder: Path) -> list[Path]:
 
 
 def photos_in(files: Files, folder: Path, deep: bool) -> list[Path]:
-    """List the photos in a folder, by the rules of `find_photos`. If `deep` is true, also list those in its subfolders."""
+    """List the photos in a folder, by the rules of `find_photos`. If `deep` is true, search subfolders, too, except folders of masks."""
     names, masks = files.images(folder), files.masks_beside(folder)
     pictures = {without_suffix(name) for name in names if name.lower().endswith(PICTURE_SUFFIXES)}
     found = [
@@ -220,11 +220,11 @@ def photos_in(files: Files, folder: Path, deep: bool) -> list[Path]:
 
 
 def leave_out_missing(source: Path, found: list[tuple[T, str, Path | None]]) -> tuple[list[tuple[T, Path]], list[str]]:
-    """Leave out missing photos: the user may have removed blurred ones. Returns the others, and a list with a warning if any are missing.
+    """Leave out photos whose files are missing: the user may have removed blurred ones. Raises InputError if more than half are missing.
 
-    `found` has three things for each photo: anything that belongs to it, its name, and its file, or None if that is missing. The first
-    and the last are returned. `source` is the file or folder that names the photos. Raises InputError if more than half are missing: then
-    `source` belongs to another capture, or was moved.
+    `found` has a tuple for each photo: any object that belongs to it, its name, and its file or None. Returns the pairs (object, file) of
+    the photos that have a file, and a list with one warning if any have none. `source` is the file or folder that names the photos. If
+    more than half are missing, `source` probably belongs to another capture, or was moved.
     """
     missing = [name for _, name, file in found if file is None]
     if 2 * len(missing) > len(found):
@@ -249,10 +249,10 @@ def photo_view(
 ) -> View:
     """Combine a photo, its camera and its mask in a View.
 
-    `as_given` is the camera and lens from the capture's file. If they are for another resolution than the photo's, they are scaled. If the
-    photo has an EXIF orientation, they are turned upright with the photo, because COLMAP and nerfstudio make cameras for photos as stored.
-    They are not turned if the camera's size already fits the upright photo and not the stored one. `mask_below` is set only for a mask that
-    is a depth map (see `View`).
+    `as_given` is the camera and lens from the capture's file. Camera and lens are scaled if they are for another resolution than the
+    photo's. If the photo has an EXIF orientation, they are turned upright with it, because COLMAP and nerfstudio make cameras for photos as
+    stored. If the camera's size fits the upright photo but not the stored one, they are not turned. `mask_below` is set only for a mask
+    that is a depth map (see `View`).
 
     Raises InputError if the photo's aspect ratio differs from the camera's, or the mask's size from the photo's. `where` is a name for the
     camera in error messages.

@@ -1,4 +1,4 @@
-"""Choose the points at which surfels start: on the visual hull, at structure-from-motion points, or at random."""
+"""Choose the points at which surfels start: on the visual hull of the masks, at structure-from-motion points, or at random."""
 
 from functools import partial
 from typing import NamedTuple
@@ -19,11 +19,11 @@ AROUND = 0.5  # largest fraction of the points that may lie outside the region
 
 
 class FirstPoints(NamedTuple):
-    """Hold the points at which surfels start, in the capture's space.
+    """Hold the points at which surfels start, in the run's frame (the world coordinates of training).
 
-    `positions` (N, 3); unit `normals` (N, 3); `spacing` (N,), the distance to the nearest points; sRGB `colours` (N, 3) in 0..1, or None if
-    unknown. The first `on_hull` points lie on the visual hull; `on_hull` is None if there is no hull. `source` says in words where the
-    points come from.
+    `positions` (N, 3); unit `normals` (N, 3); `spacing` (N,), the mean distance to the three nearest points; sRGB `colours` (N, 3) in 0..1,
+    or None if unknown. The first `on_hull` points lie on the visual hull; `on_hull` is None if there is no hull. `source` says in words
+    where the points come from.
     """
 
     positions: np.ndarray
@@ -40,9 +40,9 @@ def first_points(
     """Choose the points at which surfels start.
 
     If all photos have masks, most points lie on the visual hull of the masks. These points come first. The others lie inside the hull,
-    because masks do not show hollows. With `hollows`, the hull is first carved where photos see through it to a surface behind
-    (see `hollows.carve_hollows`). This carving needs a light that does not move. If any photo has no mask, the points are those of
-    structure from motion, or random.
+    because the hull fills the object's hollows, which masks do not show. With `hollows`, the hull is first carved where photos see through
+    it to a surface behind (see `hollows.carve_hollows`). This carving needs a light that does not move. If any photo has no mask, the
+    points are those of structure from motion, or random. There are at most `surfels.start` and at most `surfels.budget` points.
     """
     count = min(surfels.start, surfels.budget)
     if all(view.alpha is not None for view in views):
@@ -112,12 +112,12 @@ def _in_and_around(
 
 
 def _enough(points: np.ndarray, box: Box | None) -> bool:
-    """Tell whether structure from motion found at least 100 points in the region to train, enough for surfels to start at."""
+    """Tell whether there are at least 100 structure-from-motion points, in the box if there is one."""
     return len(points if box is None else points[box.contains(points)]) >= 100
 
 
 def _thinned(points: np.ndarray, capture: Capture, count: int, seed: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Choose at most `count` of the `points` (N, 3). Returns them, and their colours if these are known."""
+    """Choose at random at most `count` of the `points` (N, 3). Returns them, and their sRGB colours in 0..1, or None if unknown."""
     colours, chosen = capture.point_colors, slice(None)
     if capture.box is not None:
         chosen = np.concatenate(_in_and_around(capture.box, points, points, count, seed))
@@ -127,10 +127,10 @@ def _thinned(points: np.ndarray, capture: Capture, count: int, seed: int) -> tup
 
 
 def _random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
-    """Place `count` points at random, evenly in the region to train, or in the ball that the cameras look at if no region was given.
+    """Place `count` points at random: evenly in the user's box, or in the ball that the cameras look at if there is no box.
 
-    In a room, or if a region was given, up to half of the points are placed farther out, for the surroundings. These points are uniform
-    in inverse distance.
+    In a room or open scene, or if there is a box, up to half of the points are placed farther out, for the surroundings. The inverse
+    distances of these points from the centre are uniform.
     """
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))
@@ -151,7 +151,7 @@ def _random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
 def _towards_cameras(positions: np.ndarray, views: list[LoadedView]) -> np.ndarray:
     """Compute the unit vectors (N, 3) from each point to the nearest camera.
 
-    They are used as normals, because a surface that a photo shows faces a camera.
+    These vectors are used as normals, because a surface that a photo shows faces its camera.
     """
     cameras = np.stack([view.camera.position for view in views])
     towards = cameras[cKDTree(cameras).query(positions)[1]] - positions

@@ -1,4 +1,4 @@
-"""Load photos and masks for training: decode, undistort and reduce them. The results are sRGB codes with straight alpha.
+"""Load photos and masks for training: decode, undistort and reduce them. The results are sRGB codes (integers) with straight alpha.
 
 Colours are those that the file declares: see `refgs.capture.color_profiles`. Photos with 8 bits a channel are loaded as 8-bit codes. Photos
 with more bits (PNG and TIFF with 16, HEIC with 10, camera RAW, EXR) are loaded as 16-bit codes. In EXR and HDR photos, codes above that of
@@ -87,7 +87,7 @@ class LoadedView:
 
     @property
     def encoded(self) -> np.ndarray:
-        """Return the sRGB-encoded photo as float32 (H, W, 3): 1 is white, and an EXR may be brighter."""
+        """Return the sRGB-encoded photo as float32 (H, W, 3): 1 is white, and EXR and HDR photos may be brighter."""
         return self.image.astype(np.float32) / self.white
 
     @property
@@ -115,7 +115,7 @@ class Header(NamedTuple):
 
     @property
     def upright(self) -> tuple[int, int]:
-        """Return the width and height of the upright image. `read_image` returns it in this size."""
+        """Return the width and height of the upright image, the size in which `read_image` returns it."""
         return (self.height, self.width) if self.turns % 2 else (self.width, self.height)
 
 
@@ -133,8 +133,8 @@ def read_header(path: Path) -> Header:
 def read_focal_length(path: Path) -> float | None:
     """Return a photo's focal length in pixels, from its EXIF. Return None if EXIF does not give it.
 
-    The focal length for 35 mm film is preferred. Otherwise the focal length in mm is multiplied by the sensor's pixels per mm. Raises
-    InputError naming the file.
+    The focal length that is equivalent on 35 mm film is preferred. Otherwise the focal length in mm is multiplied by the sensor's pixels
+    per mm. Raises InputError naming the file.
     """
     size = read_header(path)[:2]
     try:
@@ -158,9 +158,9 @@ def read_image(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.n
     """Decode an image file to RGB (H, W, 3) uint8 and alpha (H, W) uint8, None without alpha.
 
     The image is turned upright by its EXIF orientation. Greyscale files and those with more than 8 bits are converted to 8-bit RGB.
-    `shrink` is 1, 2, 4 or 8: a JPEG's sides are divided by it. If one side is not divisible by `shrink`, then `shrink` is first halved
-    until both are. A RAW photo's sides are halved at most. Colours are converted to sRGB by the file's profile. With `is_data`, as for
-    normals, codes stay as stored. Raises InputError naming the file if it is truncated or unreadable.
+    Colours are converted to sRGB by the file's profile; with `is_data`, as for normals, codes stay as stored. `shrink` is 1, 2, 4 or 8. A
+    JPEG's sides are divided by `shrink`, or by the largest smaller power of 2 that divides both. A RAW photo's sides are halved at most,
+    and other formats are not reduced. Raises InputError naming the file if it is truncated or unreadable.
     """
     image, alpha, white = read_codes(path, shrink, is_data)
     return as_bytes(image, white), alpha
@@ -169,7 +169,8 @@ def read_image(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.n
 def read_codes(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.ndarray, np.ndarray | None, int]:
     """Decode an image file to RGB codes (H, W, 3), alpha (H, W) uint8 or None, and the code of white.
 
-    Codes are uint8 or uint16, as in the file. The arguments and errors are those of `read_image`.
+    Codes are uint8 if the file has 8 bits a channel, and uint16 if it has more or is HDR. The arguments and errors are those of
+    `read_image`.
     """
     if _is_raw(path):
         width, height, turns = raw.read_raw_header(path)
@@ -236,9 +237,9 @@ def read_mask(path: Path, below: float | None = None) -> np.ndarray:
     """Read a mask file as (H, W) uint8: 255 is the object, 0 the background.
 
     If the file has an alpha channel that is not opaque everywhere, the alpha channel is the mask. Otherwise the brightness is the mask. If
-    the mask has only two different values, such as 0 and 1, the smaller is the background and the larger the object. In a coloured palette,
-    the smallest index is the background, and all other indices are objects. If `below` is given, the file is a depth map instead: the
-    object is where depth is less than `below` times the largest possible value.
+    the mask has only two different values, such as 0 and 1, the smaller is the background and the larger the object. If the file has a
+    coloured palette, the smallest index in use is the background, and all others are the object. If `below` is given, the file is a depth
+    map instead: the object is where depth is less than `below` times the largest possible value.
     """
     if below is not None:
         return np.where(read_image(path, is_data=True)[0][..., 0] < 255 * below, np.uint8(255), np.uint8(0))
@@ -257,8 +258,10 @@ def read_mask(path: Path, below: float | None = None) -> np.ndarray:
 def _stored_numbers(path: Path) -> np.ndarray | None:
     """Read the numbers (H, W) that a mask's file stores, upright, without decoding them as colours.
 
-    These are the codes of a black-and-white or grey picture. For a coloured palette, True stands for all indices but the smallest that
-    occurs. For 32-bit numbers, they are these numbers, of which there are at most two different ones. Returns None for any other file.
+    - Black-and-white or grey picture: its codes.
+    - Picture with a coloured palette: bool, true for all indices but the smallest in use.
+    - Picture of 32-bit numbers with at most two different values: these numbers.
+    - Any other file: None.
     """
     if _is_raw(path) or _is_exr(path):
         return None
@@ -388,10 +391,10 @@ def _decoding(path: Path) -> Iterator[None]:
 
 
 def _decode(picture: Image.Image, path: Path, look_up: LookUp | None = None) -> Image.Image:
-    """Decode a picture to 8-bit RGB, RGBA or grey, or to CMYK if `look_up` is for it.
+    """Decode a picture to 8-bit RGB, RGBA or grey, or to CMYK if `look_up` converts from CMYK.
 
-    Pillow is used, because OpenCV does not detect a truncated file. Black and white stay one byte a pixel: a mask of 256 million pixels
-    would take 2 GB in colour.
+    Pillow is used, because OpenCV does not detect a truncated file. Black-and-white and grey pictures keep one channel: a mask of 256
+    million pixels would take 2 GB in colour.
     """
     with _decoding(path):
         if picture.mode.startswith("I;16"):
@@ -411,9 +414,9 @@ def _decode(picture: Image.Image, path: Path, look_up: LookUp | None = None) -> 
 
 
 def _as_array(picture: Image.Image, look_up: LookUp | None) -> np.ndarray:
-    """Copy a picture to an array (H, W, 3 | 4) uint8, converted by `look_up`.
+    """Copy a picture to an RGB or RGBA array (H, W, 3 | 4) uint8, converted by `look_up` if that is given.
 
-    It is copied in strips, because Pillow copies once more what it returns.
+    The picture is copied in strips, to save memory: Pillow makes another copy of what it hands out.
     """
     mode = "RGBA" if picture.mode == "RGBA" else "RGB"
     pixels = np.empty((picture.height, picture.width, len(mode)), np.uint8)
@@ -461,7 +464,7 @@ def _decode_16_bit(picture: ImageFile.ImageFile, path: Path) -> np.ndarray | Non
 
 
 def _decode_heic(picture: ImageFile.ImageFile, path: Path) -> np.ndarray:
-    """Decode a HEIC with more than 8 bits a channel, as `_decode_16_bit` does."""
+    """Decode a HEIC with more than 8 bits a channel to RGB or RGBA uint16 (H, W, 3 | 4)."""
     with _decoding(path):
         heic = open_heif(path, convert_hdr_to_8bit=False, hdr_to_16bit=False)
         largest = (1 << picture.info["bit_depth"]) - 1
@@ -470,7 +473,7 @@ def _decode_heic(picture: ImageFile.ImageFile, path: Path) -> np.ndarray:
 
 
 def as_bytes(codes: np.ndarray, white: int) -> np.ndarray:
-    """Return codes as 8-bit ones, clipped to white."""
+    """Convert codes to 8 bits, clipped to white. `white` is the code of white in `codes`; uint8 codes stay as they are."""
     return (
         codes
         if codes.dtype == np.uint8

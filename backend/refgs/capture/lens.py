@@ -7,7 +7,7 @@ because no model of COLMAP has its k4: with r² = x² + y²,
 All other models are COLMAP's, and pycolmap computes them.
 
 The undistorted photo has the same size in pixels. Its focal length is chosen so that it shows as much as possible of the distorted photo
-without black borders. A thin strip at the edges of the distorted photo is lost; of a fisheye lens's photo, more.
+without black borders. A thin strip at the edges of the distorted photo is lost. With a fisheye lens, more is lost.
 """
 
 from dataclasses import dataclass, replace
@@ -31,9 +31,9 @@ BEHIND = 1e3  # image position, at depth 1, of what a pinhole camera cannot see.
 class Lens:
     """Hold the lens of a photo: its intrinsics, the name of its model, and the model's coefficients.
 
-    Focal lengths and principal point are in pixels; pixel centres are at half-integers. BROWN has the coefficients k1, k2, k3, k4, p1, p2.
-    Any other model is COLMAP's. Its coefficients are those that COLMAP lists after the principal point. `turns` counts the clockwise
-    quarter turns by which the photo differs from the one that the coefficients describe.
+    Focal lengths and principal point are in pixels; pixel centres are at half-integers. The model BROWN has the coefficients k1, k2, k3,
+    k4, p1, p2. Any other model is COLMAP's. Its coefficients are those that COLMAP lists after the principal point. `turns` is the
+    number of clockwise quarter turns that the photo got after the coefficients were measured.
     """
 
     fx: float
@@ -46,7 +46,7 @@ class Lens:
 
     @property
     def distorts(self) -> bool:
-        """Tell whether the lens differs from a pinhole. A fisheye does so without coefficients, too."""
+        """Tell whether the lens differs from a pinhole. A fisheye lens does, even if all its coefficients are zero."""
         return any(self.coefficients) or any(map(np.any, np.subtract(self.distort(0.5, 0.25), (0.5, 0.25))))
 
     def distort(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -70,7 +70,8 @@ class Lens:
     def undistort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the undistorted image position of a distorted one: the inverse of `distort`. Both are on the image plane at depth 1.
 
-        A pinhole camera cannot see points at 90° from its axis or more. Their result is far from the image's centre, in the same direction.
+        A pinhole camera cannot see points at 90° from its axis or more. For such points the result is far from the image's centre, in the
+        direction of the distorted position.
         """
         x_seen, y_seen = np.broadcast_arrays(x, y)
         if self.model == BROWN:
@@ -92,7 +93,7 @@ class Lens:
         return np.where(found, x, BEHIND * x_seen), np.where(found, y, BEHIND * y_seen)
 
     def turned(self, height: int) -> "Lens":
-        """Return the lens for its photo turned clockwise by a quarter turn. `height` is the photo's height before, in pixels."""
+        """Return the lens for its photo turned clockwise by a quarter turn. `height` is the photo's height before the turn, in pixels."""
         return replace(self, fx=self.fy, fy=self.fx, cx=height - self.cy, cy=self.cx, turns=(self.turns + 1) % 4)
 
     def pinhole(self, camera: Camera, where: str) -> Camera:
@@ -137,7 +138,7 @@ class Lens:
 def check_intrinsics(
     size: tuple[float, float], focal: tuple[float, float], centre: tuple[float, float], where: str, advice: str
 ) -> None:
-    """Check the size, focal lengths and principal point of a photo, in pixels: pairs of horizontal and vertical.
+    """Check the size, focal lengths and principal point of a photo. Each is a pair (horizontal, vertical) in pixels.
 
     Raises InputError if a value is not finite, or if no real lens has such a value. The message begins with `where`, a name for the
     camera, and ends with `advice`.
@@ -179,8 +180,8 @@ def _colmap_camera(model: str, coefficients: tuple[float, ...]) -> Any:
 def _focal_factor(lens: Lens, width: int, height: int) -> float | None:
     """Find the smallest factor for the focal lengths with which the undistorted photo has no black borders.
 
-    A larger factor zooms in, so that every pixel lies inside the distorted photo. It is WIDEST at least. Return None if it would be above
-    2.
+    A larger factor zooms in, so that more pixels lie inside the distorted photo. The result is at least WIDEST. Return None if a factor of
+    2 is not enough.
     """
     u, v = np.meshgrid(np.linspace(0, width, 65), np.linspace(0, height, 65))
 

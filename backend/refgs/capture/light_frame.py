@@ -25,16 +25,16 @@ LESS = 0.95  # the light turns only if its model's error is below this fraction 
 
 
 def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float) -> tuple[str, str]:
-    """Find out from the photos whether the light stands still ("world") or turns with the camera ("camera").
+    """Find out from the photos whether the light stands still ("world") or turns with the camera ("camera"), as on a turntable.
 
-    Returns this answer, and the reason in words. `positions` (N, 3) and `normals` (N, 3) are points on the object's visual hull. `radius`
-    is the scene's radius.
+    Returns "world" or "camera", and the reason in words. `positions` (N, 3) and `normals` (N, 3) are points on the object's visual hull.
+    `radius` is the scene's radius.
 
-    Each possibility is tried as a model of how bright the points look. Both models are fitted to three quarters of the photos, and must
-    then predict the others. A model explains the logarithm of the brightness by a constant for each point, a constant for each photo (its
-    exposure), and spherical harmonics of some directions. For a still light, this is the mirror direction in the world. For a turning
-    light, these are the normal and the mirror direction in the camera's frame. "camera" is chosen only if its predictions are clearly
-    better. The choice takes seconds and is deterministic.
+    Two models of how bright the points look are compared, one for each kind of light. Both are fitted to three quarters of the photos, and
+    must then predict the other photos. A model explains the logarithm of the brightness by a constant for each point, a constant for each
+    photo (its exposure), and spherical harmonics of directions. The model of a still light uses the mirror direction in the world. The
+    model of a turning light uses the normal and the mirror direction in the camera's frame. "camera" is chosen only if its predictions are
+    clearly better. The choice takes seconds and is deterministic.
     """
     points, photos, brightness, still, turning = _observations(views, positions, normals, radius)
     if len(np.unique(photos)) < 2 * FOLDS or len(points) < 100:

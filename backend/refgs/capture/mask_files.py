@@ -45,7 +45,7 @@ def mask_folders(files: Files, photos: list[Path]) -> list[Path]:
 
 
 def _match(files: Files, folder: Path, root: Path, photos: list[Path]) -> dict[Path, Path]:
-    """Return the mask of each photo that has one in `folder`. If several masks fit, the one whose name is most like the photo's counts.
+    """Return the mask of each photo that has one in `folder`. If several masks fit, take the one whose name is most like the photo's.
 
     `root` is the folder to which the photos' paths are relative.
     """
@@ -76,6 +76,6 @@ def _match(files: Files, folder: Path, root: Path, photos: list[Path]) -> dict[P
 
 
 def _inner(root: Path, photo: Path) -> list[str]:
-    """Return two paths of a photo: relative to the capture's folder, and the same without its first folder, such as `images`."""
+    """Return two forms of a photo's path: relative to the folder `root`, and the same without its first folder, such as `images`."""
     parts = photo.relative_to(root).parts if photo.is_relative_to(root) else photo.parts[-1:]
     return ["/".join(some) for some in (parts, parts[1:]) if some]

@@ -1,8 +1,8 @@
 """Make masks for a capture that has cameras but no masks, and remake them when an artist's strokes change.
 
-Strokes are pictures CAPTURE/strokes/NAME.png with transparency, drawn on the upright photo. White marks the object, black marks the rest,
-and transparent pixels say nothing. The hashes of masks that the program made are in masks/made.json. All other masks are the artist's: they
-are kept, and are evidence for the other photos.
+Strokes are an artist's corrections: pictures CAPTURE/strokes/NAME.png with transparency, drawn on the upright photo. White marks the
+object, black marks the background, and transparent pixels say nothing. The hashes of masks that the program made are in masks/made.json.
+All other masks are the artist's: they are kept, and help to find the object in the other photos.
 """
 
 import hashlib
@@ -43,7 +43,7 @@ _HASHES = TypeAdapter(set[str])  # what is in it
 
 
 class ReadOnlyError(InputError):
-    """Masks cannot be made, because the capture's folder cannot be written to."""
+    """Error for a capture that gets no masks, because its folder cannot be written to."""
 
 
 def make_masks(
@@ -63,8 +63,8 @@ def make_masks(
     - `photos`, `made`, `kept`: the numbers of photos, of new masks and of kept masks.
     - `objects`: the number of separate objects.
     - `region`: the box around the objects, as settings for a training with the new masks.
-    - `moved`: a matrix (4, 4), as a list of rows. The frame of a training depends on the masks. The matrix maps the frame with the earlier
-      masks to the frame with the new masks: p_new = moved @ p.
+    - `moved`: a matrix (4, 4), as a list of rows: p_new = moved @ p. The run's frame (the world coordinates of training) depends on the
+      masks. The matrix maps points from the frame with the earlier masks to the frame with the new masks.
 
     All masks are written together at the end. An interrupted call leaves the earlier masks. Raises InputError if the artist has made all
     masks already, if the artist's masks are all white, if strokes do not fit their photo, if the model cannot be used, or if no object is
@@ -79,7 +79,10 @@ def with_masks(
     report: Report,
     model: Path | None = None,
 ) -> tuple[CaptureFiles, dict[str, Any]]:
-    """Make masks of a capture from its files. Return the files with the new masks, and the dict that `make_masks` returns."""
+    """Make masks as `make_masks` does, for a capture that `read_files` has read.
+
+    Return `files` with the new masks, and the dict that `make_masks` returns.
+    """
     folder = files.folder
     judge = _Judge(SalienceModel(model)) if model is not None else None
     capture = to_run_frame(files, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
@@ -182,7 +185,7 @@ def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, float]:
 
 
 def region_settings(box: Box) -> list[str]:
-    """Return the settings region.centre and region.size of a box. The box's edges must be parallel to the axes."""
+    """Return a box as two settings, "region.centre=[…]" and "region.size=[…]". The box's edges must be parallel to the axes."""
     size = 2 * np.linalg.norm(box.matrix[:3, :3], axis=0)
     return [
         f"region.{key}={[round(float(x), 4) + 0.0 for x in values]}"
@@ -191,7 +194,7 @@ def region_settings(box: Box) -> list[str]:
 
 
 def moved_region(wanted: RegionSettings, moved: list[list[float]]) -> RegionSettings:
-    """Convert a box to the frame that a training has with the new masks. `moved` (4, 4) is in the dict that `make_masks` returns."""
+    """Convert the box `wanted` to the frame that a training has with new masks. `moved` (4, 4) is in the dict that `make_masks` returns."""
     scale = sum(row[0] ** 2 for row in moved[:3]) ** 0.5
     centre = tuple(sum(a * b for a, b in zip(row, (*wanted.centre, 1.0), strict=True)) for row in moved[:3])
     return wanted.model_copy(update={"centre": centre, "size": tuple(scale * edge for edge in wanted.size)})
@@ -219,7 +222,7 @@ def _check_white(files: CaptureFiles, made: set[str]) -> None:
 
 
 def _root(capture: Capture) -> Path:
-    """Return the folder in which `masks` lies."""
+    """Return the folder that holds a capture's folder `masks`. Raises InputError if the layout stores masks in photos or depth maps."""
     if capture.layout in Z_UP:
         raise InputError(
             f"{capture.folder}: the masks of a {capture.layout} capture are its photos' alpha channels. Cut them out there."
@@ -232,7 +235,7 @@ def _root(capture: Capture) -> Path:
 
 
 def _inner(view: View, root: Path) -> Path:
-    """Return a photo's path relative to the folder of photos. Its mask has the same relative path in `masks`."""
+    """Return a photo's path relative to `root`, without its first folder, such as `images`. A mask has its photo's path in `masks`."""
     if not view.image_path.is_relative_to(root):
         raise InputError(f"{view.image_path}: the photo is not in the capture's folder {root}. Move it there.")
     path = view.image_path.relative_to(root)
@@ -264,7 +267,7 @@ def _hashes(root: Path) -> set[str]:
 
 
 def _choose(views: list[View], root: Path) -> list[View]:
-    """Choose the photos that carve the object: some evenly spaced photos, and all photos that have the artist's mask or strokes."""
+    """Choose the photos for carving the object: some evenly spaced photos, and all photos that have the artist's mask or strokes."""
     every = max(1, -(-len(views) // CARVED_BY))
     return [view for i, view in enumerate(views) if i % every == 0 or view.masked or _stroke_file(view, root)]
 
@@ -276,14 +279,14 @@ def _stroke_file(view: View, root: Path) -> Path | None:
 
 
 class _Judge:
-    """Find objects in photos with a model. Each photo is given to the model only once, because that may take seconds."""
+    """Find the object in photos with a segmentation model, and keep the results, because the model may take seconds for a photo."""
 
     def __init__(self, model: SalienceModel):
         self.model = model
         self.found: dict[Path, np.ndarray] = {}
 
     def __call__(self, view: View, size: tuple[int, int]) -> np.ndarray:
-        """Return the probability of the object at each pixel of a photo that is undistorted and reduced to `size` (width, height)."""
+        """Return the object's probability at each pixel, float32 (H, W), of the undistorted photo reduced to `size` (width, height)."""
         if view.image_path not in self.found:
             likely = self.model(load_view(view, self.model.side).bytes)
             shrink = min(1.0, FINE / max(likely.shape))
@@ -305,10 +308,10 @@ def _load(view: View, root: Path, side: int, judge: _Judge | None) -> Photo:
 
 
 def _read_strokes(file: Path, view: View, camera: Camera) -> np.ndarray:
-    """Read an artist's strokes as int8 (H, W): 1 marks the object, −1 the rest, 0 says nothing.
+    """Read an artist's strokes as int8 (H, W): 1 marks the object, −1 the background, 0 says nothing.
 
-    The strokes are undistorted and resized to `camera`, like the photo. Raises InputError if they lack transparency, or if their shape is
-    not the photo's.
+    The strokes are undistorted and resized to `camera`, like the photo. Raises InputError if they lack transparency, or if their aspect
+    ratio is not the photo's.
     """
     color, alpha = read_image(file, is_data=True)
     height, width = color.shape[:2]
@@ -338,7 +341,7 @@ def _small_lens(lens: Lens, camera: Camera, small: Camera) -> Lens:
 
 
 def _to_photo(view: View, mask: np.ndarray) -> np.ndarray:
-    """Convert a mask of the undistorted, reduced photo to one of the photo as it is: upright, distorted, at full size."""
+    """Convert a mask of the undistorted, reduced photo to a mask (H, W) uint8 of the upright, distorted photo at full size."""
     width, height = view.camera.width, view.camera.height
     # A step at a reduced pixel becomes a smooth edge, cut in its middle and soft over a pixel.
     smooth = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.7)

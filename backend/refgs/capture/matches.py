@@ -23,7 +23,7 @@ class Matches(NamedTuple):
     """Hold the matched pixels of two photos.
 
     `first` and `second` are the indices of the two views. `ours` and `theirs` (M, 2) are the pixels of the same M points in the first and
-    in the second photo. Pixels count in photos reduced to SIDE.
+    in the second photo. They are coordinates in photos reduced to SIDE pixels on the longer side.
     """
 
     first: int
@@ -36,8 +36,8 @@ def match_neighbours(views: list[LoadedView]) -> list[Matches]:
     """Match the features of some photos, evenly spread, each with the photo of the nearest camera. Use only pixels inside the masks.
 
     For each pair of photos, an epipolar geometry is fitted to the matches, without using the cameras. Matches that do not fit it are
-    dropped. A pair is left out if most of its matches do not fit, because the others may fit by chance. A pair with fewer than LEAST
-    matches is left out, too. Matches of reflections may remain, although reflections move over the surface when the camera moves.
+    dropped. If most matches of a pair do not fit, the pair is left out, because the few that fit may do so by chance. A pair with fewer
+    than LEAST matches is left out, too. Some matches may be wrong: a reflection moves over the surface when the camera moves.
     """
     if len(views) < 2:
         return []
@@ -91,7 +91,7 @@ def _features(view: LoadedView) -> tuple[np.ndarray, np.ndarray | None]:
 def _match(
     ours: tuple[np.ndarray, np.ndarray | None], theirs: tuple[np.ndarray, np.ndarray | None]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match the features of two photos. Returns the pixels (M, 2) in both, of distinct matches that fit one epipolar geometry."""
+    """Match two results of `_features`. Returns the pixels (M, 2) in both photos, of distinct matches that fit one epipolar geometry."""
     nothing = np.zeros((0, 2)), np.zeros((0, 2))
     (first, described), (second, others) = ours, theirs
     if described is None or others is None or min(len(described), len(others)) < LEAST:

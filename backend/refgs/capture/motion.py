@@ -8,10 +8,10 @@ first, with or without masks.
 
 If the object stands on a turntable instead, the surroundings do not turn with it and lead to wrong cameras. Therefore matches at the same
 pixel in both photos are dropped. This does not help if the camera also moved a little: some photos then get cameras that follow the
-turntable, others follow the surroundings, and some get no camera. (All 66 photos of a bronze head got cameras, 19° wrong on average.) Such
-cameras leave many feature matches unexplained. If there are masks, the cameras are then found anew from the pixels inside them, and kept if
-they explain more. A shiny object has few strong features. Therefore weaker features count, too, inside the masks. Without masks, the user
-gets a warning.
+turntable, others follow the surroundings, and some get no camera. (The cameras of 66 photos of a bronze head were 19° wrong on average.)
+Such cameras leave many feature matches unexplained. If there are masks, the cameras are then found anew from the pixels inside them. The
+new cameras are kept if they explain more matches. Inside the masks, weaker features are used, too, because a shiny object has few strong
+ones. If many matches remain unexplained, the user gets a warning.
 """
 
 import hashlib
@@ -58,8 +58,8 @@ class _Found(NamedTuple):
     """Hold what COLMAP found: which photos got a camera, the mean reprojection `error` in pixels, and reasons to doubt the cameras.
 
     `placed` are the photos that got a camera. `unexplained` is the fraction of feature matches that the cameras do not explain. `apart` is
-    the largest group of photos whose cameras fit together, but not to the cameras of `placed`. `inside` is true if only the pixels inside
-    the masks were used.
+    the largest other group of photos that COLMAP could link to each other, but not to `placed`; it is empty if there is none. `inside` is
+    true if only the pixels inside the masks were used.
     """
 
     placed: set[Path]
@@ -83,7 +83,7 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
 
     An interrupted call leaves `sparse.tmp`. The next call for the same photos resumes from it. Raises InputError if there are fewer than
     three photos, if all masks are empty, if there are cameras already, if fewer than half of the photos got a camera, or if the photos fall
-    into two large groups that share nothing.
+    into two large groups without common features.
     """
     folder = Path(folder)
     photos = find_photos(folder)
@@ -192,7 +192,7 @@ def _hash_of_files(files: list[Path]) -> str:
 def _run_colmap_in_child(
     top: Path, photos: list[Path], masks: list[Path], database: Path, model: Path, report: Callable
 ) -> _Found:
-    """Run `_run_colmap` in a child process and return its result. The process is ended even if this call is interrupted.
+    """Run `_run_colmap` in a child process, and return the _Found that it sends. The process is ended even if this call is interrupted.
 
     `report("progress", facts)` is called with the progress that the process sends. Raises InputError if a photo cannot be read.
     """
@@ -251,8 +251,8 @@ def _run_colmap(
 ) -> None:
     """Run COLMAP on the photos and write its model to the folder `model`. Send progress, and at the end a _Found, to the pipe `events`.
 
-    The model names photos by their paths in the folder `top`. The whole photos are used first. If that fails or its cameras are doubtful,
-    the pixels inside the masks are tried.
+    The model names photos by their paths in the folder `top`. The whole photos are used first. If too few of them get a camera, or the
+    cameras leave many feature matches unexplained, the pixels inside the masks are tried.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     import pycolmap
@@ -279,7 +279,7 @@ def _run_colmap(
 
 
 def _search(photos: list[Path], masks: list[Path], database: Path, progress: Callable) -> tuple[Any, _Found]:
-    """Find cameras from the whole photos, or from the pixels inside the masks if there are any.
+    """Find cameras from the whole photos, or only from the pixels inside the masks if `masks` is not empty.
 
     Returns the largest model and a _Found about it. The model is a pycolmap.Reconstruction, whose images are named by the photos' indices.
     It is None if no photo got a camera.
@@ -302,7 +302,7 @@ def _search(photos: list[Path], masks: list[Path], database: Path, progress: Cal
 
 
 def _describe(models: list[Any], photos: list[Path], database: Path, inside: bool) -> tuple[Any, _Found]:
-    """Return the largest model, which is the first of `models`, and a _Found about it.
+    """Return the largest COLMAP model, which is the first of `models`, and a _Found that describes it.
 
     If `models` is empty, return None and a _Found without photos.
     """

@@ -2,7 +2,7 @@
 
 NeRF-Synthetic and Shiny Blender have this layout. If the test file is missing, `transforms_val.json` is used for testing.
 
-Shiny Blender also has true normals, NAME_normal.png. They have the encoding that Ref-NeRF's code reads (class `Blender` in multinerf's
+Shiny Blender also has true normals, NAME_normal.png. They are encoded as Ref-NeRF's code reads them (class `Blender` in multinerf's
 `internal/datasets.py`). Its scene `ball` has masks, NAME_alpha.png. Other images are ignored: depth, disparity, and NeRF-Synthetic's
 NAME_normal_0000.png, whose encoding is undocumented.
 """
@@ -34,10 +34,10 @@ def read_nerf_blender(folder: Path) -> tuple[list[View], list[str]]:
 
 
 def published_normals(view: View, max_side: int | None = None) -> tuple[np.ndarray, np.ndarray] | None:
-    """Read the true normals of a view and its alpha. Return None if the data set has no normals.
+    """Read a view's true normals and its mask. Return None if the data set has no normals.
 
-    Normals (H, W, 3) are float32 unit vectors in the capture's world coordinates, zero outside the object. Alpha (H, W) is float32 in 0..1.
-    Both have the size that `load_view` returns. Raises InputError naming the file.
+    Normals (H, W, 3) are float32 unit vectors in the capture's world coordinates, 0 where the mask is 0. The mask (H, W) is float32 in
+    0..1, all 1 if the view has none. Both have the size to which `load_view` reduces the photo. Raises InputError naming the file.
     """
     if view.normal_path is None:
         return None

@@ -102,7 +102,7 @@ _Step = Callable[[pickle.Unpickler], None]
 class _Arrays(pickle._Unpickler):
     """Read a pickle with only the classes and functions in `_NAMES`.
 
-    The reader written in Python is used. With the one written in C, a file of a few bytes could reserve gigabytes.
+    The base class is the unpickler written in Python. In the one written in C, a file of a few bytes could reserve gigabytes of memory.
     """
 
     read: Callable[[int], bytes]  # `load` sets these two

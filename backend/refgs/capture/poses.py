@@ -16,8 +16,8 @@ def world_to_camera(camera_to_world: object, where: str) -> np.ndarray:
     """Check a camera-to-world matrix (4×4 or 3×4) from a file, and return its inverse: a rigid world-to-camera matrix, (4, 4) float64.
 
     The axis convention stays that of the input. A uniform scale is dropped, because the camera sees the same without it. The rotation is
-    made orthonormal. Raises InputError for NaN, for a singular matrix, for a reflection, and for a stretch of more than 1 %. The message
-    begins with `where`, a name for the camera.
+    made orthonormal. Raises InputError for NaN, for a position too far away, for a singular matrix, for a reflection, and for a stretch of
+    more than 1 %. The message begins with `where`, a name for the camera.
     """
     advice = "Export the cameras again, or remove this frame."
     try:

@@ -57,8 +57,8 @@ def with_priors(views: list[View], root: Path) -> list[View]:
 def _find(views: list[View], root: Path, folder: Path) -> dict[View, Path]:
     """Find the prior of each training view in `folder`. Return {view: file}, without views that have no prior.
 
-    If a view has several files, the one whose suffix comes first in SUFFIXES is taken. As for masks, the first folder of a photo's path may
-    be left out: `0001.png` is for `images/0001.jpg`. A file is not used if its name fits two training photos, or only a held-out photo.
+    If a view has several files, the one whose suffix comes first in SUFFIXES is taken. A prior's path may lack the first folder of its
+    photo's path: `0001.png` is for `images/0001.jpg`. A file is not used if its name fits two training photos, or only a held-out photo.
     """
     named: dict[str, list[View]] = {}
     for view in sorted(views, key=lambda view: view.split != "train"):
@@ -146,7 +146,7 @@ def _read(path: Path, channels: int) -> np.ndarray:
 
 
 def _read_array(path: Path, channels: int) -> np.ndarray:
-    """Read an array from a NumPy file as float32 (H, W, C). In the file, its shape may be (C, H, W), and have more axes of length 1."""
+    """Read an array from a NumPy file as float32 (H, W, C). The file may also hold (C, H, W), or additional axes of length 1."""
     try:
         loaded = read_array(path, "Save it again.")
         values = loaded.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Find the layout of a capture's folder, and read its cameras and the list of its photos into the run's frame."""
+"""Find a capture's file layout, read its photos' cameras, and convert them to the run's frame (the world coordinates of training)."""
 
 import hashlib
 import os
@@ -62,7 +62,7 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
 
 
 def read_files(folder: Path) -> CaptureFiles:
-    """Read the photos' cameras from a capture's folder, in the capture's own coordinates. No photo and no mask is decoded."""
+    """Read the photos' cameras from a capture's folder, in the capture's own coordinates. Decodes no photo or mask. Raises InputError."""
     folder = Path(folder)
     layout = _check_layout(folder)
     views, points, colors, warnings = _read(folder, layout)
@@ -76,9 +76,9 @@ def read_files(folder: Path) -> CaptureFiles:
 
 
 def to_run_frame(files: CaptureFiles, wanted: RegionSettings | None = None) -> Capture:
-    """Convert a capture that `read_files` has read to the run's frame. `wanted` is as for `read_capture`.
+    """Convert a capture that `read_files` has read to the run's frame (the world coordinates of training).
 
-    This reads some masks, to find the region of interest.
+    `wanted` may set a box and an up direction, as for `read_capture`. Some masks are read, to find the region of interest.
     """
     folder, layout, points = files.folder, files.layout, files.points
     views, silhouettes, white = _silhouettes(files.views)
@@ -111,7 +111,10 @@ def to_run_frame(files: CaptureFiles, wanted: RegionSettings | None = None) -> C
 
 
 def _check_layout(folder: Path) -> str:
-    """Return the file layout of a capture's folder, such as "colmap". Raise InputError if the folder holds no capture."""
+    """Return the file layout of a capture's folder, such as "colmap". Raise InputError if the folder holds no capture.
+
+    The error is NoCameras if the folder holds photos without cameras.
+    """
     check_folder(folder)
     layout = find_layout(folder)
     if layout is not None:
@@ -166,7 +169,7 @@ def _check_photos(views: list[View]) -> None:
 
 
 def _shared_photos(views: list[View]) -> list[str]:
-    """Check whether photos are both training and test views. Return a list with one warning if so, otherwise an empty list."""
+    """Return a list with one warning if the same photos are both training and test views, otherwise an empty list."""
     tested, trained = ({view.image_path for view in views if view.split == split} for split in ("test", "train"))
     shared = tested & trained
     if not shared:
@@ -176,7 +179,7 @@ def _shared_photos(views: list[View]) -> list[str]:
 
 
 def _hold_out(views: list[View]) -> list[View]:
-    """Choose test views for a capture that has none: every eighth view, sorted by path. They are held out from training."""
+    """Make every eighth view, sorted by path, a test view that is held out from training. If there are test views, change nothing."""
     if any(view.split == "test" for view in views):
         return views
     views = sorted(views, key=lambda view: view.image_path.as_posix())
@@ -234,8 +237,8 @@ def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.nda
 def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray, float]:
     """Choose the run's frame: +Z is up, and the region of interest is a ball of radius 1 about the origin.
 
-    Return the similarity transform (4, 4) from the run's frame to the capture's, and its scale. A capture whose layout is one of Z_UP keeps
-    its own coordinates, unless its region of interest is so far away, so large or so small that float32 is too inexact.
+    Return the similarity transform (4, 4) from the run's frame to the capture's, and its scale. A capture whose layout is in Z_UP (+Z is up
+    in its files) keeps its own coordinates, unless its region of interest is so far away, large or small that float32 is too inexact.
     """
     if layout in Z_UP:
         if is_near(region):

@@ -18,7 +18,7 @@ STRIP = 1 << 18  # pixels of the photo in a strip, about
 def reduced(
     image: np.ndarray, alpha: np.ndarray | None, white: int, camera: Camera, fitted: Camera, lens: Lens | None = None
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Undistort a photo by `lens` and reduce it from the size of `camera` to that of `fitted`. Returns its codes and alpha.
+    """Undistort a photo by `lens`, if given, and reduce it from the size of `camera` to that of `fitted`. Returns new codes and alpha.
 
     `image` (H, W, 3) are sRGB codes, uint8 or uint16, in which `white` is the code of radiance 1. `alpha` (H, W) is uint8 or None. Linear
     radiance is averaged over each new pixel's area, weighted by alpha. The new alpha is None if `alpha` is; else fully transparent pixels
@@ -51,7 +51,7 @@ def reduced(
 def reduced_map(values: np.ndarray, alpha: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Reduce a map (H, W) or (H, W, C), such as normals, and its alpha (H, W) to the size of `camera`, both as float32.
 
-    Values are averaged over each new pixel's area, weighted by alpha; they are 0 where alpha is. Unit vectors are shortened by this.
+    Values are averaged over each new pixel's area, weighted by alpha; they are 0 where alpha is. A mean of unit vectors is shorter than 1.
     """
     weights = alpha if values.ndim == 2 else alpha[..., None]
     size = camera.width, camera.height
@@ -97,7 +97,10 @@ def _undistorted(
 
 
 def _area_weights(rows: slice, source: slice, ratio: float) -> np.ndarray:
-    """Return a matrix (R, S) that averages the S rows `source` of a photo over the areas of the reduced photo's R `rows`."""
+    """Return a matrix (R, S) that averages the S rows `source` of a photo over the areas of the reduced photo's R `rows`.
+
+    `ratio` is the photo's height divided by the reduced photo's.
+    """
     edges = np.arange(rows.start, rows.stop + 1) * ratio
     row = np.arange(source.start, source.stop)
     shared = np.minimum(row + 1, edges[1:, None]) - np.maximum(row, edges[:-1, None])

@@ -1,4 +1,4 @@
-"""Find a capture's region of interest: a ball around the object or place that the cameras look at. Also define the run's frame."""
+"""Find a capture's region of interest, a ball around what the cameras look at, and the run's frame (the world coordinates of training)."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,10 +111,10 @@ def look_at_centre(views: list[View]) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def warn_of_axes(layout: str, views: list[View]) -> list[str]:
-    """Return a warning if a JSON file's axes look like OpenCV's: the cameras look away from the place where their optical axes meet.
+    """Return a list with one warning if a JSON file's axes look like OpenCV's: cameras look away from where their optical axes meet.
 
-    The axes of cameras that look out of a room hardly meet, so these cameras cause no warning. Cameras on a rig may look outwards and have
-    axes that meet. So this is only a warning: the file is still read with the axes of its format.
+    Return [] otherwise, and for other layouts. The axes of cameras that look out of a room hardly meet, so these cause no warning. Cameras
+    on a rig may look outwards and have axes that meet. So this is only a warning: the file is still read with the axes of its format.
     """
     _, depth, miss = look_at_centre(views)
     if layout not in ("nerfstudio", "nerf-blender") or (depth < 0).mean() < 0.75 or miss > 0.25:
@@ -176,7 +176,7 @@ def _shows_something(view: View) -> bool:
 
 
 def empty_masks(files: list[Path]) -> InputError:
-    """Return the error that all these masks are empty: mask files, or photos with transparency."""
+    """Make the error for a capture whose masks are all empty. `files` are the mask files, or photos with transparency."""
     first = files[0]
     return InputError(
         f"{first.parent}: all {len(files)} masks are empty, {first.name} too. Remove them, or make them anew, the object white on black."
@@ -214,7 +214,8 @@ def _carve(
 ) -> tuple[np.ndarray, float] | None:
     """Return a ball (centre, radius) about the visual hull: the space that lies inside the masks of the photos. None if it is empty.
 
-    Test a grid in the cube centre ± half. Then test a second grid, over the bounding box of the points that were kept.
+    Test a grid of points in the cube centre ± half. Then test a second grid, over the bounding box of the points that were kept. If `box`
+    is given, only points inside it are kept.
     """
     kept, cell = _inside_masks(silhouettes, centre - half, centre + half, box)
     if len(kept):

@@ -1,4 +1,4 @@
-"""Run a model of the artist's own, an ONNX file, that tells the object from its surroundings in one photo.
+"""Run a segmentation model that the artist supplies as an ONNX file: it finds the object's pixels in a single photo.
 
 ONNX Runtime runs in a child process, because it ends its process for some damaged files.
 """
@@ -28,8 +28,8 @@ class SalienceModel:
     """Model of salient-object segmentation, such as U²-Net, IS-Net or BiRefNet, on the CPU.
 
     The model's input is a photo (1, 3, height, width) float32 RGB, normalised as for ImageNet. Its first output is one number for each
-    pixel. If any of these numbers is negative, all are taken for logits. If none is negative but one is greater than 1, all are scaled to
-    0..1. Otherwise they are taken for probabilities. `side` is the longer side of the input, in pixels. Raises InputError if the file is
+    pixel. If any of these numbers is negative, they are all logits. If none is negative but one is greater than 1, they are all scaled to
+    0..1. Otherwise they are probabilities. `side` is the longer side of the input, in pixels. Raises InputError if the file is
     missing, damaged or another type of model, or if ONNX Runtime is not installed.
     """
 
@@ -73,7 +73,7 @@ class SalienceModel:
 
 
 def _child(file: Path, pipe: Connection) -> None:
-    """Run a model in this process. First send the height and width of its input. Then, for each photo received, send its probabilities.
+    """Run a model in the child process. First send its input's height and width. Then, for each photo received, send the probabilities.
 
     If the model or a photo fails, send the InputError and end.
     """
@@ -90,7 +90,7 @@ def _child(file: Path, pipe: Connection) -> None:
 
 
 def _load(file: Path) -> tuple[Any, tuple[int, int]]:
-    """Load a model. Return its session, and the height and width of its input."""
+    """Load a model. Return its ONNX Runtime session, and the height and width of its input in pixels."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -113,7 +113,7 @@ def _load(file: Path) -> tuple[Any, tuple[int, int]]:
 
 
 def _run(file: Path, session: Any, image: np.ndarray) -> np.ndarray:
-    """Return the probabilities (H, W) that a model finds in a photo (H, W, 3) uint8 of the size of its input."""
+    """Return the object's probability at each pixel (H, W) of a photo (H, W, 3) uint8 that has the size of the model's input."""
     batch = np.ascontiguousarray(((image.astype(np.float32) / 255 - MEAN) / DEVIATION).transpose(2, 0, 1)[None])
     try:
         found = session.run([session.get_outputs()[0].name], {session.get_inputs()[0].name: batch})[0]

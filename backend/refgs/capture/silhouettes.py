@@ -1,10 +1,10 @@
 """Find an object's silhouettes in photos with known cameras: the pixels that have the object's colours, and agree with a carved shape.
 
 Photos are segmented together (after Campbell et al. 2010, "Automatic 3D object segmentation in multiple views").
-A grid of voxels holds the probability that the object is there. Two steps alternate: the colour histograms of object and surroundings are
-learned from the voxels' projection; and voxels are kept where nearly all photos show the object's colours. GrabCut (OpenCV) then finds the
-exact edges. A voxel in a hole of the object shows the surroundings' colours in neighbouring photos, too. A voxel in a highlight does not,
-because the highlight moves over the surface.
+Each voxel of a grid holds the probability that it lies in the object. Two steps alternate: the colour histograms of object and surroundings
+are learned from the voxels' projection; and voxels are kept where nearly all photos show the object's colours. GrabCut (OpenCV) then finds
+the exact edges. Neighbouring photos tell a hole from a highlight: a voxel in a hole shows the surroundings' colours in both, a voxel at a
+highlight only in one, because the highlight moves over the surface.
 """
 
 from dataclasses import dataclass
@@ -37,8 +37,8 @@ LEVELS = (20, 32, 32)  # bins of the histograms, in Lab
 class Photo:
     """Hold a reduced photo: `image` (H, W, 3) uint8 RGB, and its pinhole `camera`.
 
-    `known` (H, W) int8 is 1 where the pixel is known to show the object, −1 where it is known not to, and 0 elsewhere. `salient` (H, W), if
-    given, is the probability of the object that a segmentation model computed. It then replaces the evidence from colours.
+    `known` (H, W) int8 is 1 where an artist's mask or stroke marks the object, −1 where it marks the background, and 0 elsewhere. `salient`
+    (H, W), if given, is the object's probability by a segmentation model. It is then used in place of the pixel's colour.
     """
 
     image: np.ndarray
@@ -48,7 +48,7 @@ class Photo:
 
     @cached_property
     def bins(self) -> np.ndarray:
-        """Return the histogram bin of each pixel, (H, W)."""
+        """Return the index of each pixel's bin in a flattened colour histogram, (H, W)."""
         lab = cv2.cvtColor(self.image, cv2.COLOR_RGB2LAB).astype(int)
         a, b = (np.clip((lab[..., i] - 128) // 5 + 16, 0, 31) for i in (1, 2))
         return (lab[..., 0] * LEVELS[0] // 256 * LEVELS[1] + a) * LEVELS[2] + b
@@ -56,10 +56,10 @@ class Photo:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Hold a carved shape: `occupied` (GRID³,) is its probability at the points of `box.grid(GRID)`.
+    """Hold a carved shape: `occupied` (GRID³,) is the probability that a point of `box.grid(GRID)` lies in it.
 
-    `objects` is the number of separate objects. `colors` are the histograms of the object's and of the surroundings' colours. `backdrop` is
-    the plane that carries the object, or None.
+    `objects` is the number of separate objects. `colors` are two histograms: of the object's colours, and of the surroundings'. `backdrop`
+    is the plane that carries the object, or None.
     """
 
     box: Box
@@ -80,7 +80,7 @@ class Shape:
         return Box(matrix)
 
     def project(self, camera: Camera) -> np.ndarray:
-        """Return the largest probability along each pixel's ray, (H, W) float32."""
+        """Return the largest of the shape's probabilities along each pixel's ray, (H, W) float32."""
         return _project_voxels(self.occupied, self.box, camera)
 
 
@@ -176,7 +176,8 @@ def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
 def _only_connected(mask: np.ndarray, solid: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Drop the parts of a mask that do not touch the shape's projection `solid`, and close the holes that the shape does not have.
 
-    The closed holes are highlights, which GrabCut took for surroundings. Pixels that the user's strokes fix (`known`) do not change.
+    The closed holes are highlights, which GrabCut took for surroundings. A part is also kept if `known` is 1 somewhere in it, and a hole
+    if `known` is −1. Returns bool (H, W).
     """
     _, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     kept = np.isin(parts, np.unique(parts[(mask > 0) & (solid | (known > 0))])) & (mask > 0)
@@ -187,7 +188,10 @@ def _only_connected(mask: np.ndarray, solid: np.ndarray, known: np.ndarray) -> n
 
 
 def _neighbours(photos: list[Photo], centre: np.ndarray) -> np.ndarray:
-    """Pair each photo with the one whose direction to `centre` differs least, but by 5° to 40°. Return indices of photos (N, 2)."""
+    """Pair each photo with a neighbour: their directions from `centre` differ by 5° to 40°, as little as possible.
+
+    Returns indices of photos (N, 2). Photos without a neighbour are left out.
+    """
     away = np.array([photo.camera.position for photo in photos]) - centre
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     angle = np.degrees(np.arccos(np.clip(away @ away.T, -1, 1)))
@@ -197,7 +201,7 @@ def _neighbours(photos: list[Photo], centre: np.ndarray) -> np.ndarray:
 
 
 def _pixels(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the index of the pixel that shows each point (N,), −1 if the photo does not show it."""
+    """Return the flat index (row · width + column) of the pixel that shows each point, (N,). It is −1 if no pixel does."""
     at, depth = project(camera, points)
     shown = inside(camera, at, depth)
     column, row = np.where(shown[:, None], at, 0).astype(np.int32).T
@@ -212,7 +216,7 @@ def _footprint(box: Box, camera: Camera) -> float:
 
 
 def _project_voxels(occupied: np.ndarray, box: Box, camera: Camera, at: np.ndarray | None = None) -> np.ndarray:
-    """Return the largest value of the voxels along each pixel's ray, (H, W) float32, blurred by about the size of a voxel.
+    """Return the largest value in `occupied` (GRID³,) along each pixel's ray, (H, W) float32, blurred by about the size of a voxel.
 
     `at` may give the result of `_pixels` for all voxels, so that it is not computed again.
     """
@@ -241,16 +245,16 @@ def _hidden(prior: np.ndarray) -> np.ndarray:
 
 
 def _plain(photo: Photo, prior: np.ndarray, backdrop: Backdrop | None) -> np.ndarray | None:
-    """Return how well each pixel's colour fits the bare plane (H, W), as `Backdrop.likelihood`. Return None if there is no plane."""
+    """Return how well each pixel's colour fits the bare plane, (H, W): see `Backdrop.likelihood`. Return None if there is no plane."""
     return None if backdrop is None else backdrop.likelihood(photo.image, photo.camera, _hidden(prior))
 
 
 def _surroundings(ours: np.ndarray, theirs: np.ndarray, plain: np.ndarray | None) -> np.ndarray:
     """Return the likelihood of each pixel's colour if the pixel shows the surroundings, (H, W).
 
-    `ours` and `theirs` (H, W) are the colour's likelihoods by the histograms of the object and of the surroundings. `plain` is the result
-    of `Backdrop.likelihood`. If it is None, or where it is NaN, the result is `theirs`. Where it is negative, it holds odds, and the result
-    is `ours` divided by these odds. Elsewhere the result is mostly `plain`.
+    `ours` and `theirs` (H, W) are the colour's likelihoods by the histograms of the object and of the surroundings. `plain` (H, W) is the
+    result of `Backdrop.likelihood`, or None. Where it is a likelihood, the result is mostly `plain`. Where it is negative, it is minus the
+    odds of object to plane, and the result is `ours` divided by these odds. Where it is NaN or None, the result is `theirs`.
     """
     if plain is None:
         return theirs
@@ -263,9 +267,10 @@ def _weights(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return two weights of each pixel (H, W): in the histogram of the object's colours, and in that of the surroundings'.
 
-    A pixel in the shape has a smaller weight if its colour fits the surroundings better, by the histograms `colors`: the shape may wrongly
-    close a hole there. Pixels in a band around the shape have no weight in either histogram. The shape may still lack parts of the object,
-    and their colours must not be learned as the surroundings'.
+    `prior` (H, W) is the shape's projection, and `plain` (H, W) the result of `Backdrop.likelihood`, or None. A pixel in the shape has a
+    smaller weight if its colour fits the surroundings better, by the histograms `colors`: the shape may wrongly close a hole there. Pixels
+    in a band around the shape have no weight in either histogram. The shape may still lack parts of the object, and their colours must not
+    be learned as the surroundings'.
     """
     ours = prior * (prior > 0.5)
     if colors is not None:
@@ -290,7 +295,8 @@ def _learn_colors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return two histograms, averaged over the photos: of the object's colours, and of the surroundings'.
 
-    `before` are the histograms of the last round, or None in the first.
+    `priors` (H, W) are the shape's projections, `plains` the results of `_plain`. `before` are the histograms of the last round, or None in
+    the first.
     """
     pairs = [
         [_histogram(photo.bins, weight) for weight in _weights(photo, prior, plain, before)]
@@ -302,7 +308,7 @@ def _learn_colors(
 def _posterior(
     photo: Photo, prior: np.ndarray, plain: np.ndarray | None, colors: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
-    """Return the probability that each pixel shows the object.
+    """Return the probability that each pixel shows the object, (H, W).
 
     Two sources are combined. One is the shape's projection `prior`. The other is the model's probability, if the photo has `salient`, or
     else the pixel's colour: how well it fits the histograms of all photos, those of this photo, and the bare plane.

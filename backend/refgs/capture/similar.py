@@ -20,10 +20,10 @@ RANKS = *range(8), 9, 11, 14, 18, 24, 32, 43  # by likeness, of the photos that 
 def similar_pairs(read: Callable[[int], np.ndarray], count: int, beside: int) -> set[tuple[int, int]]:
     """Pair each of `count` photos with others that look like it. Return pairs of indices, the smaller one first.
 
-    `read(index)` returns the descriptors of a photo's features, (M, D) of any dtype. It is called twice for each photo. Photos at most
-    `beside` places from each other are not paired. The other photos are sorted by likeness, the most similar first. Each photo is paired
-    with those at the places RANKS in this order. RANKS has gaps: among many photos, the most similar ones were all taken from nearby, so
-    that photos from other rounds around the object come later in the order. The same photos always give the same pairs.
+    `read(index)` returns the descriptors of a photo's features, (M, D) of any dtype. It is called twice for each photo. Photos whose
+    indices differ by at most `beside` are not paired. For each photo, the others are sorted by likeness, the most similar first, and those
+    at the positions RANKS are taken. RANKS has gaps, because the most similar of many photos were all taken from nearby: photos from other
+    rounds around the object come later. The same photos always give the same pairs.
     """
     random = np.random.default_rng(0)
     sample = np.concatenate([random.permutation(read(index))[:SAMPLE] for index in range(count)])

@@ -96,7 +96,7 @@ _LARGEST = 1e9  # of a coefficient: those of r⁸ are large for long lenses
 
 
 def _says_perspective(value: object) -> bool:
-    """Tell whether a value of an unknown key about the lens changes nothing: it is zero, empty, false, or a word for perspective."""
+    """Tell whether a lens key that the program does not know can be ignored: its value is zero, empty, false, or a word for perspective."""
     if isinstance(value, str):
         return value.upper() in ("", "NONE", *_PERSPECTIVE)
     if isinstance(value, list | dict):
@@ -144,7 +144,7 @@ _CONVENTIONS = {"opengl": OPENGL_TO_OPENCV, "blender": OPENGL_TO_OPENCV, "opencv
 
 
 def _camera_to_world(frame: Frame, where: str) -> np.ndarray | None:
-    """Return a frame's camera-to-world matrix, converted to OpenCV's axes. Return None if its rows are not of equal length, or not of four.
+    """Return a frame's camera-to-world matrix, converted to OpenCV's axes. Return None if a row does not have four numbers.
 
     In the file, the axes are those that the key `camera_convention` names, or else OpenGL's. Raises InputError for an unknown name.
     """

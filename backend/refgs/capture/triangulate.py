@@ -1,6 +1,6 @@
 """Triangulate points of a scene from photos with known cameras, with COLMAP (pycolmap).
 
-COLMAP runs in a child process, as in `motion`.
+COLMAP runs in a child process, because it ends its process when there is nothing to match.
 """
 
 import multiprocessing
@@ -53,7 +53,7 @@ def triangulate(views: list[View], progress: Callable[[int, int], None]) -> np.n
 
 
 def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
-    """Choose pairs of cameras to match: each with NEIGHBOURS near ones that look in directions about ANGLE apart. Returns index pairs."""
+    """Pair each camera with NEIGHBOURS near ones whose viewing directions differ by about ANGLE degrees. Returns pairs of indices."""
     position = np.array([camera.position for camera in cameras])
     forward = np.array([camera.world_to_camera[2, :3] for camera in cameras])
     angle = np.degrees(np.arccos(np.clip(forward @ forward.T, -1, 1)))

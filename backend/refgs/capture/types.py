@@ -50,7 +50,7 @@ class View:
 
 
 class CaptureFiles(NamedTuple):
-    """Hold what the files of a capture say, in the capture's own coordinates. Fields are as those of `Capture`."""
+    """Hold what the files of a capture say, in the capture's own coordinates. Fields are those of `Capture`; `colors` is `point_colors`."""
 
     folder: Path
     layout: str
@@ -62,7 +62,7 @@ class CaptureFiles(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """Photos with cameras, in the run's frame: the world coordinates used in training, with Z up.
+    """Photos with cameras, in the run's frame: the world coordinates of training, with Z up.
 
     - `to_capture` is the 4×4 float64 similarity p_capture = to_capture @ p_run. If the capture's layout is in Z_UP, it is the identity,
       unless the region of interest is too far away, too large or too small for float32. Other captures are rotated, moved and scaled: Z is
@@ -109,22 +109,22 @@ class Capture:
 
     @cached_property
     def hashes(self) -> dict[str, str]:
-        """Hash the files that a training reads: photos, masks, normals and depths guessed by other programs. Keys are relative paths."""
+        """Hash the files that a training reads: photos, masks, and other programs' normals and depths. Keys are relative paths."""
         files = [(v.image_path, v.mask_path, v.prior_normals, v.prior_depth) for v in self.views]
         return hash_files(self.folder, [path for paths in files for path in paths if path is not None])
 
     def fingerprint(self) -> str:
-        """Return a SHA-256 hash of `digest` and of the contents of all files. It changes if the capture is changed.
+        """Return a SHA-256 hash of `digest` and `hashes`. It changes if a camera, or the contents of a file, is changed.
 
         The files are read in the first call. Raises InputError naming the file that cannot be read.
         """
         return hashlib.sha256(json.dumps([self.digest, self.hashes], sort_keys=True).encode()).hexdigest()
 
     def check_unchanged(self, run: Path, known: str) -> None:
-        """Raise InputError if this is not the capture that `run` was trained on, or if it has changed since. The error names a file.
+        """Raise InputError if this is not the capture that `run` was trained on, or if it has changed since.
 
-        `known` is the hash in run.toml: a fingerprint, or in runs of earlier releases a `digest`. The digest depends on the sizes of files,
-        not on their contents.
+        `run` is a run folder. `known` is the hash in its run.toml: a `fingerprint`, or in runs of earlier releases a `digest`, which
+        depends on the sizes of files, not on their contents. The error names a changed file if the run folder has the hashes of files.
         """
         if known in (self.digest, self.fingerprint()):
             return

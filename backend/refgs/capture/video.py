@@ -57,7 +57,7 @@ class _Film:
 
 @dataclass(eq=False)
 class _Candidate:
-    """Hold the sharpest frame of a stretch: its sharpness, a small grey picture (h, w) uint8, and the JPEG file it is written to."""
+    """Hold the sharpest frame of a stretch of time: its sharpness, a small grey picture (h, w) uint8, and its JPEG file."""
 
     sharpness: float
     grey: np.ndarray
@@ -71,12 +71,12 @@ def extract_photos(
 
     The video's time is divided into `count` equal stretches. The sharpest frame of each stretch is taken. It is left out if it is much less
     sharp than the frames of the neighbouring stretches, or if the camera has not moved since the last photo. Photos are turned and mirrored
-    as players show the video, with square pixels; interlaced frames are deinterlaced. Colours are converted to sRGB as the video declares
-    them. Of HDR (HLG, PQ), the white of diffuse surfaces becomes white, and what is brighter is clipped.
+    as players show the video, with square pixels; interlaced frames are deinterlaced. Colours are converted to sRGB from the colour space
+    that the video declares. In HDR video (HLG, PQ), the white of diffuse surfaces becomes white, and anything brighter is clipped.
 
-    Memory holds one frame in full size, and a small grey picture for each stretch. `report("progress", facts)` is called after each frame.
-    `done` and `total` count frames. `kept` and `blurred` count the stretches so far. Returns the counts `frames`, `photos`, `blurred` and
-    `duplicates`.
+    Memory holds one frame in full size, and a small grey picture for each stretch. `report("progress", facts)` is called after each frame:
+    `done` and `total` in the dict `facts` count frames, `kept` and `blurred` count the stretches so far. Returns a dict of the counts
+    `frames`, `photos`, `blurred` and `duplicates`.
 
     Raises InputError, and leaves nothing behind, if `out`/images exists, if the file is not a video or is truncated, or if fewer than three
     photos remain.
@@ -117,7 +117,7 @@ def sharpness(grey: np.ndarray) -> float:
 
     It is the sum of squared second derivatives divided by the sum of squared first derivatives. Both are taken in the direction that gives
     the smallest result, because motion blurs in one direction only. Sharp texture (power spectrum 1/f²) has a sharpness of 0.4. The same
-    texture, blurred with a standard deviation of 1, 2 or 3 pixels, has 0.26, 0.13 or 0.07. Edges have half as much.
+    texture, blurred with a standard deviation of 1, 2 or 3 pixels, has 0.26, 0.13 or 0.07. For edges, these values are half as large.
     """
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)  # else a dark frame's noise counts as sharp detail
     across, down = _gradient(smooth)
@@ -227,7 +227,7 @@ def _frames(film: _Film) -> Iterator[tuple[float, av.VideoFrame]]:
 
 
 def _deinterlaced(film: _Film) -> Iterator[av.VideoFrame]:
-    """Decode a video. From the first interlaced frame on, interlaced frames are deinterlaced (FFmpeg's bwdif)."""
+    """Decode a video and yield its frames. Interlaced frames are deinterlaced (FFmpeg's bwdif). Sets `film.matrix`."""
     graph = None
     for number, frame in enumerate(film.container.decode(film.stream)):
         if number == 0:
@@ -250,7 +250,7 @@ def _deinterlaced(film: _Film) -> Iterator[av.VideoFrame]:
 
 
 def _pulled(graph: av.filter.Graph) -> Iterator[av.VideoFrame]:
-    """Yield the frames that a graph of filters has ready."""
+    """Yield the frames that an FFmpeg filter graph has ready."""
     while True:
         try:
             yield graph.vpull()
@@ -259,7 +259,7 @@ def _pulled(graph: av.filter.Graph) -> Iterator[av.VideoFrame]:
 
 
 def _display_matrix(frame: av.VideoFrame) -> tuple[int, int, int, int]:
-    """Return a frame's display matrix without its shift, rounded to quarter turns: see `_Film`."""
+    """Return a frame's display matrix (a, b, c, d) without its translation, rounded to quarter turns: see `_Film`."""
     data = frame.side_data.get("DISPLAYMATRIX")
     if data is None:
         return 1, 0, 0, 1
@@ -271,9 +271,10 @@ def _display_matrix(frame: av.VideoFrame) -> tuple[int, int, int, int]:
 
 
 def _sharpest(film: _Film, work: Path, count: int, report: Callable) -> tuple[int, list[_Candidate]]:
-    """Find the sharpest frame of each of `count` stretches, and write it to the folder `work`. Stretches without frames are skipped.
+    """Find the sharpest frame in each of `count` equal stretches of time, and write it to the folder `work`.
 
-    Returns how many frames were read, and the candidates in the order of time.
+    Stretches without frames are skipped. `report` is called as by `extract_photos`. Returns how many frames were read, and the candidates
+    in the order of time.
     """
     length = film.length
     rate = float(film.stream.average_rate or 0)
@@ -325,10 +326,10 @@ def _sharp(candidates: list[_Candidate]) -> list[_Candidate]:
 
 
 def _choose(video: Path, frames: int, candidates: list[_Candidate]) -> tuple[list[_Candidate], int, int]:
-    """Leave out blurred candidates, and candidates before which the camera did not move.
+    """Leave out blurred candidates and duplicates. Before a duplicate, the camera has not moved since the last candidate that was kept.
 
     Returns the candidates that are left, the number of blurred ones and the number of duplicates. Raises InputError if fewer than
-    MIN_PHOTOS are left.
+    MIN_PHOTOS are left. The error names `video` and the number of its `frames`.
     """
     if len(candidates) < MIN_PHOTOS:
         raise InputError(f"{video}: too few frames in it ({frames}). {REFILM}.")
@@ -353,7 +354,7 @@ def _grey(film: _Film, frame: av.VideoFrame, converter: VideoReformatter) -> np.
 
 
 def _square(film: _Film, frame: av.VideoFrame) -> tuple[int, int]:
-    """Return the width and height of a frame with square pixels. Neither is smaller than the frame's."""
+    """Return the width and height that a frame gets when its pixels are made square. Neither side becomes smaller."""
     return round(frame.width * max(film.aspect, 1)), round(frame.height * max(1 / film.aspect, 1))
 
 
