@@ -26,7 +26,7 @@ def _face_direction(face: Tensor, s: Tensor, t: Tensor) -> Tensor:
 
 
 def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the points where directions (..., 3) meet the cube. Returns their face and their coordinates s and t on it, in [−1, 1].
+    """Find the points where directions (..., 3) meet the cube. Returns three tensors (...): the face, 0..5, and s and t on it, in [−1, 1].
 
     s and t are differentiable. A direction of length zero gives face 0 and s = t = 0.
     """
@@ -69,8 +69,8 @@ def orbits(resolution: int) -> Tensor:
     group, called an orbit. Its first texel lies on face +x where s, t > 0. The rows are sorted by this texel's row and column on the face.
     Each texel of the cubemap occurs once.
 
-    Column 8·p + b holds the image of the first texel under symmetry number 8·p + b. This symmetry flips the signs of x, y and z where b has
-    the bits 1, 2 and 4. Then it applies p times the permutation +x → +y → +z → +x.
+    Column 8·p + b holds the image of the first texel under symmetry number 8·p + b. This symmetry flips the signs of axes: of x if b has
+    the bit 1, of y if it has the bit 2, of z if it has the bit 4. Then it applies p times the permutation +x → +y → +z → +x.
     """
     texel = torch.arange(6 * resolution**2).reshape(3, 2, resolution, resolution)  # axis, its sign, t, s
     for dim in (2, 4):  # count each half from the face's middle outwards; its sign is a dimension before it
@@ -98,9 +98,9 @@ def in_texel_order(levels: Tensor, sides: tuple[int, ...]) -> Tensor:
 
 @lru_cache(maxsize=1)
 def compositions() -> Tensor:
-    """Tabulate which symmetry results from applying two of the cube's 24 symmetries: (24, 24).
+    """Tabulate which symmetry results from applying two of the cube's 24 symmetries one after the other: (24, 24).
 
-    Entry [a, b] is the number of the symmetry that applies a first, then b. They are numbered as the columns of `orbits`.
+    Entry [a, b] is the number of the symmetry that applies a first, then b. Symmetries are numbered as the columns of `orbits`.
     """
     first, then = torch.arange(SYMMETRIES)[:, None], torch.arange(SYMMETRIES)
     turn, signs = first // 8, then % 8
@@ -138,9 +138,9 @@ def padded(sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
 
     Returns three tensors:
 
-    - the index of the texel at each cell of the faces with borders, (Σ 6·(side + 2)²,)
-    - the index of each cubemap's first cell
-    - the side of each cubemap in texels
+    - for each cell of the faces with borders, the index of its texel in the stack, (Σ 6·(side + 2)²,)
+    - for each cubemap, the index of its first cell
+    - for each cubemap, its side in texels
     """
     indices, starts, texels = [], [], 0
     for side in sides:
@@ -167,7 +167,7 @@ def _bilinear(face: Tensor, s: Tensor, t: Tensor, level: Tensor, sides: tuple[in
 
 
 def reduced(texels: Tensor, side: int) -> Tensor:
-    """Reduce a cubemap's texels (6·R², C) to `side` texels along a side (6·side², C), by averaging."""
+    """Reduce a cubemap's texels (6·R², C) to `side` texels along a side (6·side², C), by averaging blocks of texels."""
     fine = math.isqrt(len(texels) // 6) // side
     return texels.reshape(6, side, fine, side, fine, -1).mean(dim=(2, 4)).reshape(6 * side * side, -1)
 

@@ -35,7 +35,7 @@ class Environment:
 
     @property
     def harmonics(self) -> Tensor:
-        """Compute the coefficients (16, 3) of the radiance in spherical harmonics up to degree 3."""
+        """Compute the coefficients (16, 3) of `radiance` in the spherical harmonics up to degree 3."""
         directions, area = cubemap.texel_directions(self.resolution), cubemap.texel_solid_angles(self.resolution)
         return (harmonics.basis(directions, 3) * area[:, None]).T.float().to(self.radiance.device) @ self.radiance
 
@@ -52,7 +52,7 @@ class Environment:
         return Environment(cubemap.reduced(self.radiance, side), self.reference)
 
     def panorama(self, height: int) -> np.ndarray:
-        """Convert the light to an equirectangular picture of radiance (height, 2·height, 3) in Blender's orientation."""
+        """Convert `radiance` to an equirectangular picture (height, 2·height, 3), linear, in Blender's orientation."""
         directions = torch.from_numpy(panorama_directions(height, 2 * height)).reshape(-1, 3).float()
         level = torch.zeros(len(directions))
         colour = cubemap.sample(self.radiance.detach().cpu(), (self.resolution,), directions, level)
@@ -60,9 +60,9 @@ class Environment:
 
     @classmethod
     def from_panorama(cls, panorama: np.ndarray, resolution: int, reference: Camera | None = None) -> "Environment":
-        """Make the light from an equirectangular picture (H, W, 3) in Blender's orientation.
+        """Make the light from an equirectangular picture (H, W, 3) of linear radiance, in Blender's orientation.
 
-        Each texel of the cubemap is the mean of the picture over the texel's area.
+        `resolution` is the number of texels along a side of the cubemap. Each texel is the mean of the picture over the texel's area.
         """
         fine = max(
             1, math.ceil(panorama.shape[0] / (2 * resolution))

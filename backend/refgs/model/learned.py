@@ -38,9 +38,9 @@ class Moments:
 class Learned(Mapping[str, Tensor]):
     """Hold the tensors that a training learns, by name, with Adam's moments, learning rates and limits.
 
-    A tensor is by row if it has one row for each surfel. The rows of all such tensors are replaced together (see `rows`). A tensor by row
-    may get no gradient, such as a mask: its rows are replaced as well, but Adam does not change it. `constant` holds the tensors that no
-    longer learn, each with one row for all surfels.
+    A tensor that has one row for each surfel is called "by row". The light's texels are not. The rows of all tensors by row are
+    replaced together (see `rows`). A tensor by row may get no gradient, such as a mask: its rows are replaced as well, but Adam does not
+    change it. `constant` holds the tensors by row that no longer learn, each with one row that all surfels share.
 
     One kernel updates all tensors with Adam (Kingma and Ba 2015). Elements whose gradient is zero keep their value and their moments. So a
     surfel that is not visible does not move. In the original Adam it would still move, because its moments decay slowly.
@@ -49,7 +49,7 @@ class Learned(Mapping[str, Tensor]):
     BETAS, EPSILON = (0.9, 0.999), 1e-15
 
     def __init__(self, radius: float = 1.0, brightest: float = math.inf) -> None:
-        """Start without tensors. `radius` is the scene's, and `brightest` the highest raw value of the light's texels (see `limits`)."""
+        """Start without tensors. `limits` uses the scene's `radius` (world units) and the highest raw value of light, `brightest`."""
         self.rates: dict[str, float] = {}
         self.moments: dict[str, Moments] = {}  # of the tensors that Adam has updated
         self.constant: dict[str, Tensor] = {}
@@ -77,7 +77,7 @@ class Learned(Mapping[str, Tensor]):
         return len(self._values["position"])
 
     def limits(self, name: str) -> tuple[float, float]:
-        """Return the lowest and the highest raw value, before activation, that a tensor may take.
+        """Return the lowest and the highest raw value, before activation, that elements of a tensor may take.
 
         Beyond these limits, gradients would be too small to move the value back.
         """
@@ -90,7 +90,8 @@ class Learned(Mapping[str, Tensor]):
     def learn(self, name: str, value: Tensor, by_row: bool = True) -> None:
         """Start to learn a tensor from the values in `value`, without moments.
 
-        A tensor that has this name already is replaced. Its learning rate stays.
+        `by_row` says that it has one row for each surfel. A tensor that has this name already is replaced. Its learning rate stays; that of
+        a new tensor is 0.
         """
         self._values[name] = _leaf(value)
         self.moments.pop(name, None)
@@ -114,11 +115,11 @@ class Learned(Mapping[str, Tensor]):
 
     @torch.no_grad()
     def rows(self, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
-        """Replace all surfels: surfel i of the result is a copy of surfel `index`[i]. An index may occur more than once.
+        """Replace all surfels: new surfel i is a copy of old surfel `index`[i]. An index may occur more than once.
 
-        Each surfel keeps its moments, except that surfels of the result with an index in `fresh` start with zero moments. Adam then moves
-        these surfels faster than others at first. Pictures get worse for a while, but for captures without masks, the final result is
-        better. If memory runs out, all surfels stay as they were.
+        Moments are copied, too, but new surfels whose indices are in `fresh` start with zero moments. Adam then moves them faster than
+        others at first. Pictures get worse for a while, but for captures without masks, the final result is better. If memory runs out, all
+        surfels stay as they were.
         """
         values = {name: _leaf(value.detach()[index]) for name, value in self.by_row.items()}
         moments = {}
@@ -151,7 +152,7 @@ class Learned(Mapping[str, Tensor]):
             old.mean[which] = old.square[which] = 0
 
     def has_learned(self, name: str) -> bool:
-        """Tell whether Adam has taken a step with a tensor since it was set."""
+        """Tell whether Adam has taken a step with a tensor since `learn` or `fill` set it."""
         return name in self.moments
 
     def gradients(self) -> list[Tensor]:
@@ -166,7 +167,7 @@ class Learned(Mapping[str, Tensor]):
     @timed("optimiser")
     @torch.no_grad()
     def step(self, accepted: Tensor | None = None) -> None:
-        """Update all tensors that have a gradient, once, with their learning rates.
+        """Take one step of Adam with all tensors that have a gradient, at their learning rates. Values are clamped to `limits`.
 
         `accepted` is a float32 scalar on the tensors' device, or None. If it is zero, values and moments do not change.
         """
@@ -205,9 +206,9 @@ class Learned(Mapping[str, Tensor]):
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         """Take over a checkpoint's values of the tensors that are learned or constant now.
 
-        A parameter may be constant in the checkpoint and learned here: then its one row is repeated for all surfels. It may be learned in
-        the checkpoint and constant here: then its first row is taken. A learned tensor that is not by row is dropped if the checkpoint
-        lacks it. Raises KeyError if any other tensor is missing.
+        If a tensor by row is constant in the checkpoint but learned now, its one row is repeated for all surfels. If it is learned in the
+        checkpoint but constant now, its first row is taken. A learned tensor that is not by row is dropped if the checkpoint lacks it.
+        Raises KeyError if any other tensor is missing.
         """
         rows = len(tensors["parameter.position"])
         self.moments.clear()
@@ -251,5 +252,5 @@ def belong_together(tensors: Mapping[str, Tensor]) -> bool:
 
 
 def _leaf(value: Tensor) -> Tensor:
-    """Return a tensor that gets gradients, unless it holds no floats."""
+    """Return `value` as a leaf tensor of autograd, sharing its memory. It gets gradients if it holds floats."""
     return value.detach().requires_grad_(value.is_floating_point())

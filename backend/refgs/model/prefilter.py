@@ -6,8 +6,8 @@ D(cos(θ/2)) cos θ. D is the GGX distribution, and θ is the angle between that
 each filtered level is a constant sparse matrix times the cubemap.
 
 To keep the matrices small, they read a pyramid: the cubemap, followed by its mips, which are averaged 2×2. Fine texels cover the centre of
-the lobe, coarse texels its tail. The matrices have the cube's symmetries, so only a 24th of their entries is computed and stored. This
-takes 0.05 s for 6×64² texels and 0.25 s for 6×128², so they are not cached on disk.
+the lobe, coarse texels its tail. The matrices have the cube's symmetries, so only a 24th of their entries is computed and stored. They
+are not cached on disk, because computing them takes only 0.05 s for 6×64² texels and 0.25 s for 6×128².
 """
 
 from collections.abc import Callable
@@ -81,8 +81,8 @@ def _level_weights(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tup
     texels, and `lobe` is the filter as a function of the cosine.
 
     Returns three arrays with an entry for each weight: the index of the pyramid's texel, the index of the level's texel in orbit order
-    (`cubemap.orbit_order`), and the weight. Only the pyramid's texels in one quarter of face +x are listed: the second half of its rows
-    and columns. The weights of all other texels follow from the cube's symmetries. All weights of a texel of the level sum to one.
+    (`cubemap.orbit_order`), and the weight. Only the pyramid's texels in one quarter of face +x are listed and counted: the second half of
+    its rows and columns. The weights of all other texels follow from the cube's symmetries. All weights of a texel of the level sum to one.
     """
     axes = cubemap.texel_directions(side)[cubemap.orbits(side).flatten()].numpy()
     sides = _pyramid_sides(resolution)
@@ -110,7 +110,7 @@ def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, sid
     """Average a lobe over the area of each of P texels. Returns (P,).
 
     `axes` (P, 3) are unit directions: for each texel, the one in which the lobe points. The texels lie on face +x of a cubemap with `side`
-    texels a side. `row` and `column` (P,) are their indices on the face; 0 is the first texel after its middle.
+    texels a side. `row` and `column` (P,) are their indices, counted from the face's middle: 0 is the first texel after it.
     """
     value = np.zeros(len(axes))
     x, y, z = np.ascontiguousarray(axes.T)
@@ -152,7 +152,7 @@ def _matrix_and_transpose(
     """Make a `Matrix` and its transpose from the first row of each group of 24 rows. The other rows follow from it (see `Matrix`).
 
     `orbit`, `column` and `number` list the nonzero elements of these rows: the index of the group, the column, and the value. `shape` is
-    the number of groups of rows and the number of groups of 24 columns.
+    the number of groups of 24 rows and the number of groups of 24 columns.
     """
     # A number at row 24 i, column 24 j + h is also at row 24 i + g, column 24 j, where g is the inverse of h.
     inverse = (cubemap.compositions() == 0).int().argmax(dim=1).numpy()

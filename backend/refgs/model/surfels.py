@@ -38,14 +38,15 @@ def axes(rotations: Tensor) -> list[Tensor]:
 class Surfels(NamedTuple):
     """Hold N surfels as they are rendered: their values after the activation functions.
 
-    Lengths are in world units. Albedo is linear Rec.709; albedo, metallic and roughness are in 0..1.
-
-    - `sh_dc` (N, 1, 3) and `sh_rest` (N, K − 1, 3) are spherical harmonics of a view-dependent colour: colour = 0.5 + SH. The constant is
-      separate because it has its own learning rate.
+    - `positions` (N, 3) and `scales` (N, 2), standard deviations along two axes, are in world units. 3D Gaussians have `scales` (N, 3).
+    - `rotations` (N, 4) are quaternions wxyz of any length. `opacities` (N,) are in 0..1.
+    - `albedo` (N, 3), linear Rec.709, `metallic` (N,) and `roughness` (N,) are in 0..1.
+    - `sh_dc` (N, 1, 3) and `sh_rest` (N, K − 1, 3) are spherical harmonics of a view-dependent colour: colour = 0.5 + SH. The constant
+      harmonic is separate because it has its own learning rate.
     - `received` (N, 3) is the irradiance at the surfel divided by the irradiance without occlusion. It can exceed 1 where the object
       reflects light onto itself.
-    - `indirect_dc` and `indirect_rest` are spherical harmonics of the linear radiance that the object itself sends to the surfel
-      (Ref-Gaussian paper, Eq. 10).
+    - `indirect_dc` (N, 1, 3) and `indirect_rest` (N, K − 1, 3) are spherical harmonics of the linear radiance that comes to the surfel from
+      the object itself (Ref-Gaussian paper, Eq. 10).
     """
 
     positions: Tensor
@@ -77,7 +78,7 @@ class Surfels(NamedTuple):
         return Surfels(*(value[which] for value in self))
 
     def turned(self, which: Tensor) -> "Surfels":
-        """Flip the normals of those surfels that the mask `which` (N,) selects. Returns all surfels."""
+        """Return all surfels, with flipped normals where the mask `which` (N,) is true."""
         w, x, y, z = self.rotations.unbind(-1)
         turned = torch.stack([-x, w, z, -y], dim=-1)  # q · (0, 1, 0, 0): a half turn about t_u
         return self._replace(rotations=torch.where(which[:, None], turned, self.rotations))
@@ -123,9 +124,9 @@ class _Activate(Function):
 def activate(p: Parameters) -> Surfels:
     """Apply the activation functions to the raw parameters `p` (see `Parameters`). Returns the surfels as they are rendered.
 
-    The function of metallic gets closer to 0 and 1 than the logistic function. This matters for mirrors: at metallic 0.985, a mirror also
-    has a little diffuse white. This white is as bright as the mirror image of a dark corner. Training then makes the light too dark there,
-    to compensate.
+    The activation of metallic gets closer to 0 and 1 than the logistic function. This matters for mirrors: at metallic 0.985, a mirror also
+    has a faint white diffuse reflection, as bright as the mirror image of a dark corner. Training then makes the light in this corner too
+    dark, to compensate.
     """
     scales, opacities, albedo, metallic, roughness = _Activate.apply(*(p[name] for name in _KINDS))
     return Surfels(
@@ -173,9 +174,9 @@ def initial_parameters(
 ) -> Parameters:
     """Make the raw parameters of N round surfels at `positions` (N, 3) with unit `normals` (N, 3).
 
-    `spacing` (N,) becomes the surfels' standard deviation. `colours` (N, 3), sRGB-encoded in 0..1, become the colours; without them, all
-    surfels are grey. The other arguments are the same for all surfels. With `axes=3` the result is 3D Gaussians, whose third scale, along
-    the normal, is FLAT times the other two.
+    `spacing` (N,) becomes the surfels' standard deviation, in world units. `colours` (N, 3), sRGB-encoded in 0..1, become the spherical
+    harmonics; without them, all surfels are grey. The other arguments are the same for all surfels, after activation. With `axes=3` the
+    result is 3D Gaussians, whose third scale, along the normal, is FLAT times the other two.
     """
     n = len(positions)
 

@@ -1,7 +1,4 @@
-"""Decide whether a training can skip two things: its first stage, and the last fifth of its remaining iterations.
-
-The first stage shades each surfel, before blending. The second stage shades each pixel, after blending.
-"""
+"""Decide whether a training can skip two things: the initial stage, and the last fifth of its remaining iterations."""
 
 from refgs.formats.needs import Found
 from refgs.train.decide.need import ASKED, Decision, Given, Moment, Need
@@ -10,7 +7,7 @@ from refgs.train.state import State
 
 
 class Initial(Need):
-    """Decide whether the training needs a first stage that shades each surfel. The later stage shades each pixel, after blending."""
+    """Decide whether the training needs the initial stage, which shades surfels before blending. Later, pixels are shaded."""
 
     name, what = "initial", "a first stage of surfels shaded one by one"
     moments = ("start",)

@@ -36,7 +36,7 @@ class Reflections(Need):
     def measure(self, state: State, given: Given) -> Decision:
         """Decide by two measurements whether inter-reflection is needed.
 
-        The first is `given.hidden`, the fraction of the object's pixels that mirror the object itself. The second is how many dB
+        The first is `given.hidden`, the fraction of the object's pixels that mirror the object itself. The second is how many dB of PSNR
         inter-reflection can gain at most. Inter-reflection is needed if both reach their thresholds over the whole object. If a small part
         gains much, a smaller fraction suffices. Nothing is measured if the user's setting is "off".
         """
@@ -68,7 +68,7 @@ class Reflections(Need):
 
 
 def share_hidden(hidden: float) -> str:
-    """Return a sentence for the user that gives `hidden`, the fraction of the object's pixels that mirror the object itself, in percent."""
+    """Return a message for the user: on how many percent of its pixels the object mirrors itself. `hidden` is this number as 0..1."""
     return f"the object mirrors itself on {hidden:.1%} of it"
 
 
@@ -180,6 +180,6 @@ class Degrees(Need):
 
 
 def _shortened(inputs: RenderInputs, field: str, count: int) -> RenderInputs:
-    """Return rendering inputs in which a field of the surfels, such as `sh_rest`, has only its first `count` harmonic coefficients."""
+    """Return a copy of `inputs` in which a field of the surfels, such as `sh_rest`, has only its first `count` harmonic coefficients."""
     values = {field: getattr(inputs.surfels, field)[:, :count]}
     return inputs._replace(surfels=inputs.surfels._replace(**values))

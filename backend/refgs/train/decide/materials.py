@@ -70,7 +70,7 @@ class Specular(Need):
     def look_again(self, state: State) -> Decision | None:
         """Look at a matte scene once more, halfway through the training: by then the surfels lie on the surface.
 
-        Returns the decision to bring specular shading back if colours change with the view after all.
+        If colours change with the view after all, returns the decision to bring specular shading back. Otherwise returns None.
         """
         if state.needed(self.name) or (found := state.needs[self.name]).statistic is None or found.again is not None:
             return None
@@ -91,7 +91,7 @@ def _learn_again(state: State, names: list[str]) -> None:
 class Constants(Need):
     """Decide whether splats.ply needs columns for metallic and roughness.
 
-    A column is left out if all surfels have about the same value.
+    A column is left out if all surfels have about the same value in it.
     """
 
     name, what = "constants", "columns for metallic and roughness"
@@ -113,10 +113,10 @@ class Constants(Need):
 
     @torch.no_grad()
     def common(self, state: State, surfels: Surfels, kept: Tensor) -> dict[str, tuple[float, float]]:
-        """Find out which of metallic and roughness have about the same value for all surfels.
+        """Find out which of metallic and roughness have about the same value for all surfels that the mask `kept` (N,) selects.
 
-        Returns these, by name, with the common value and the width of the range of values. Only surfels whose entry in `kept` (N,) is true
-        are compared.
+        Returns (common value, width of the range of values) of each, by name. If the user's setting is "off", both are returned, however
+        wide their ranges are. If it is "on", none is.
         """
         if self.asked(state) == "on" or not state.method.lit:
             return {}

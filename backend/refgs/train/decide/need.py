@@ -41,11 +41,11 @@ class Decision(NamedTuple):
 
 
 class Given(NamedTuple):
-    """Hold what the caller of `Need.measure` has measured.
+    """Hold what is measured before `Need.measure` is called, for its use.
 
     - `done`: how many iterations are done.
     - `hidden`: the fraction of the object's pixels that mirror the object.
-    - `common`: {"metallic" or "roughness": (common value, width of the range)}, for those nearly equal in all surfels of splats.ply.
+    - `common`: {"metallic" or "roughness": (common value, width of the range)}, if nearly equal in all surfels of splats.ply.
     - `kept`: the number of surfels in splats.ply.
     """
 
@@ -88,8 +88,7 @@ class Need:
     def undo(self, state: State, why: str) -> None:
         """Bring this optional part of the training back, after `apply` has left it out. `why` is the reason, for the record.
 
-        Only parts whose decision can be taken back have this method. It may be called again if the training returns to an earlier
-        checkpoint.
+        Only parts whose decision can be taken back have this method. It may be called again after a return to an earlier checkpoint.
         """
         raise NotImplementedError
 

@@ -1,8 +1,7 @@
 """Decide which optional parts of the training a scene needs. Such a part, for example inter-reflection, is called a need.
 
 A decision compares a measured value with a threshold, and is recorded in needs.json. A part that is not needed is left out: settings,
-parameters or photos are changed. The record says how much PSNR on training views this costs, and how many seconds it saves in the remaining
-iterations.
+parameters or photos are changed. The record says how much PSNR on training views this costs, and how many seconds of training it saves.
 """
 
 import json
@@ -29,9 +28,9 @@ BY_NAME = {need.name: need for need in NEEDS}
 
 
 def evaluate(state: State, moment: Moment, given: Given = Given()) -> list[str]:  # noqa: B008  (it is frozen)
-    """Decide about the optional parts of the training (needs) that are due at a `moment`, such as "start" or "mesh".
+    """Make the decisions about optional parts of the training (needs) that are due at this `moment`, such as "start" or "mesh".
 
-    Returns the names of the needs decided. `given` is passed on to `Need.measure`.
+    Returns the names of the needs on which a decision was made. `given` is passed on to `Need.measure`.
     """
     decided: list[str] = []
     for need in NEEDS:
@@ -51,7 +50,10 @@ def look_again(state: State, step: Step) -> None:
 
 
 def bring_back_specular(state: State, why: str) -> bool:
-    """Bring back specular shading and what was left out with it, because of `why`. Returns False if it is on, or off by a setting."""
+    """Bring back specular shading and what was left out with it. Returns False, without a change, if it is on or the user turned it off.
+
+    `why` is the reason, for the record.
+    """
     if state.needed(SPECULAR.name) or SPECULAR.asked(state) != "auto":
         return False
     _bring_back_specular(state, Decision(True, why))
@@ -104,7 +106,7 @@ def _record(state: State, need: Need, decision: Decision) -> None:
 def restore(state: State, recorded: dict[str, Found]) -> None:
     """Take over the decisions of a checkpoint, and leave out again the parts of the training that were not needed.
 
-    `recorded` are the checkpoint's decisions by name. If the training goes back to an earlier checkpoint, later decisions stay.
+    `recorded` are the checkpoint's decisions by name. Decisions that this process made after the checkpoint stay.
     """
     before, now = (decisions.get(SPECULAR.name) for decisions in (recorded, state.needs))
     if before and now and now.needed and not before.needed:  # brought back after this checkpoint

@@ -16,8 +16,8 @@ LEAST_GROWTH = 2  # even the smallest object may get this many times the surfels
 class ObjectSize(NamedTuple):
     """Hold the object's size in pixels of the photos as loaded: medians over views. Both values are 0 if a photo has no mask.
 
-    `span` is the longer side of a mask's bounds, and `area` is the number of pixels in the mask. If the user set a region to train, they
-    are at most the diameter and the area of a circle: the ball around the region, as the photo shows it.
+    `span` is the longer side of a mask's bounds, and `area` is the number of pixels in the mask. If the user set a region to train, the
+    ball around it is seen as a circle in the photo: `span` is at most its diameter, and `area` its area.
     """
 
     span: float
@@ -43,7 +43,10 @@ def object_size(state: State) -> ObjectSize:
 
 
 def surfel_budget(settings: SurfelSettings, area: float) -> int:
-    """Return how many surfels an object of `area` pixels in a photo may get: `density` per pixel, but no more than `budget`."""
+    """Return how many surfels an object of `area` pixels may get: `density` a pixel, from LEAST_GROWTH · `start` to `budget`.
+
+    If `density` is 0, it is `budget`.
+    """
     if settings.density == 0:
         return settings.budget
     return min(settings.budget, max(LEAST_GROWTH * settings.start, round(settings.density * area)))

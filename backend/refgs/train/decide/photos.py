@@ -61,17 +61,14 @@ class Outside(Need):
 
 
 def time_crops(state: State, step: Step) -> None:
-    """Measure how many seconds training on cropped photos saves. Add the result to the recorded decision to crop them (see `Outside`).
-
-    This is done once.
-    """
+    """Measure once how many seconds training on cropped photos saves. Add them to the recorded decision to crop (see `Outside`)."""
     if state.crops is not None and state.needs["outside"].seconds is None:
         seconds = (1 - 1 / WHOLE_EVERY) * probe.seconds_saved(state, whole=True)
         state.needs["outside"] = state.needs["outside"].model_copy(update={"seconds": seconds})
 
 
 def duplicate_views(views: list[LoadedView], radius: float) -> list[int]:
-    """Find views that duplicate an earlier view.
+    """Return the indices of views that duplicate an earlier view. `radius` is the object's (see `motion`).
 
     A view is a duplicate if points of the object move by less than ALIKE_PIXELS between the two photos, and the photos look the same.
     """
@@ -88,7 +85,8 @@ def duplicate_views(views: list[LoadedView], radius: float) -> list[int]:
 def motion(one: LoadedView, other: LoadedView, radius: float) -> float:
     """Return an upper bound, in pixels, of how far a point of the object moves from one photo to the other.
 
-    The bound is infinite if the photos differ in size, or if only one of them has a mask.
+    The object is assumed to lie within `radius`, in world units, of the origin. The bound is infinite if the photos differ in
+    size, or if only one of them has a mask.
     """
     a, b = one.camera, other.camera
     if (a.width, a.height) != (b.width, b.height) or (one.alpha is None) != (other.alpha is None):
@@ -101,5 +99,5 @@ def motion(one: LoadedView, other: LoadedView, radius: float) -> float:
 
 
 def _agreement(one: LoadedView, other: LoadedView) -> float:
-    """Compute the PSNR in dB between two photos of the same size. Their encoded values are clipped to at most 1."""
+    """Compute the PSNR in dB between two photos of the same size. sRGB-encoded values above 1 count as 1."""
     return psnr(*(np.minimum(view.encoded, 1) for view in (one, other)))

@@ -26,10 +26,10 @@ Pair = Callable[[State, Found, list[int]], Iterator[tuple[Tensor, Tensor]]]
 
 @torch.no_grad()
 def write_pictures(state: State, name: str, found: Found) -> Pictures | None:
-    """Write pictures for the decision about the need `name`: with the part, without it, and the photo.
+    """Write three pictures of a view: rendered with an optional part of the training, without this part, and the photo.
 
-    The pictures show the view in which the two renderings differ most. `found` is the recorded decision. Returns the view's name, the
-    files' paths in the run folder, and the PSNR of both renderings, in dB. Returns None for a need without pictures.
+    `name` is that of the part in `refgs.train.decide.needs`, and `found` the decision about it. The view is the one whose two renderings
+    differ most. Returns its name, the files' paths in the run folder, and the PSNR of both renderings in dB; None if there is no picture.
     """
     if name not in PAIRS:
         return None
@@ -68,7 +68,7 @@ def _specular(state: State, found: Found, views: list[int]) -> Iterator[tuple[Te
 
 
 def _reflections(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render each view twice. Mirror rays that hit the object get its mean radiance in the first picture, and the light in the second.
+    """Render each view twice: mirror rays that hit the object return its mean radiance first, and the environment's light second.
 
     Both are guesses: what these rays see is not known before they are traced. Yields nothing without a mesh.
     """

@@ -1,6 +1,6 @@
 """Train on reduced photos first. An iteration's time grows with the number of pixels, and early iterations need no fine details.
 
-Small objects are trained on full photos from the start: if an object spans only 64 pixels, photos of half the size lose 0.3 dB.
+Small objects are trained on full photos from the start: if the object spans only 64 pixels, half-size photos cost 0.3 dB of PSNR.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,8 @@ LEAST_SPAN = 200  # pixels that the object must span in reduced photos
 class Coarse(Part):
     """Remember the training's stages, and the reduced photos of the present stage. Each stage has its own size of photos.
 
-    The sides of `photos` are divided by `factor`, which is 1 for full photos. `crops` are the parts of `photos` that are trained on.
+    `photos` are the training photos with both sides divided by `factor`. `crops` are the parts of them that are trained on; None: all.
+    If `factor` is 1, both are unset, and `State.photos` are used.
     """
 
     name, saved = "coarse", ("factor",)
@@ -37,14 +38,14 @@ class Coarse(Part):
 
 
 def stages(pixels: float) -> tuple[Stage, ...]:
-    """Plan the stages of a training whose object has a span of `pixels` in the full photos."""
+    """Plan the stages for an object that spans `pixels` in the full photos. In reduced photos, it must span LEAST_SPAN pixels."""
     return *(Stage(*stage) for stage in PHOTO_STAGES if pixels / stage[1] >= LEAST_SPAN), *FULL
 
 
 def begin(state: State, pixels: float, refined: bool) -> None:
-    """Choose the stages of a training whose object has a span of `pixels` in the full photos, and start with the first one.
+    """Choose the stages for an object that spans `pixels` in the full photos, and start with the first one.
 
-    If poses are `refined`, full photos are used from the progress POSES_KNOWN on, because poses are judged at that time.
+    If poses are `refined`, no stage with reduced photos lasts beyond the progress POSES_KNOWN, because poses are judged at that time.
     """
     if state.settings.image.coarse == "off":
         return
@@ -62,8 +63,7 @@ def begin(state: State, pixels: float, refined: bool) -> None:
 def refine(state: State, step: Step) -> None:
     """Switch to larger photos when the training's progress reaches the stage that uses them.
 
-    The training never switches back to smaller photos. Progress can fall if the training gets more iterations, but the photos then keep
-    their size.
+    If the training gets more iterations, its progress falls. The photos then keep their size.
     """
     coarse = state.part(Coarse)
     factor = stage_at(step.progress, coarse.stages).factor
@@ -74,7 +74,7 @@ def refine(state: State, step: Step) -> None:
 
 
 def set_factor(state: State, factor: int) -> None:
-    """Train on photos reduced by a factor, 1 for full photos."""
+    """Set the factor by which the training photos are reduced, 1 for full photos, and make the reduced photos."""
     coarse = state.part(Coarse)
     if factor == coarse.factor:
         return
@@ -87,7 +87,7 @@ def set_factor(state: State, factor: int) -> None:
 
 
 def photo(state: State, view: int, whole: bool) -> Photo:
-    """Return the crop of a view's photo in the size that is trained on now, or the whole photo if `whole` is true."""
+    """Return a view's photo in the present stage's size. It is cropped to the pixels that are trained on, unless `whole` is true."""
     coarse = state.part(Coarse)
     if coarse.factor == 1:
         return state.photo(view, whole)
@@ -95,7 +95,7 @@ def photo(state: State, view: int, whole: bool) -> Photo:
 
 
 def move_camera(state: State, view: int, camera: Camera) -> None:
-    """Replace the camera of a training view's reduced photo. `camera` is that of the full photo."""
+    """Replace the camera of a training view's reduced photo, if there is one. `camera` is the new camera of the full photo."""
     coarse = state.part(Coarse)
     if coarse.factor > 1:
         small = coarse.photos[view]

@@ -44,11 +44,11 @@ class Guard:
     def look(self, state: State, whole: bool, complete: Callable[[], list[int]]) -> str:
         """Look for numbers that are not finite: warn of skipped steps, and remove surfels that have such numbers.
 
-        Surfels are only checked if steps were skipped since the last call, or if `whole` is true. `complete` lists
-        the iterations that have a complete checkpoint.
+        Numbers are only checked if steps were skipped since the last call, or if `whole` is true. `complete` lists the iterations that have
+        a complete checkpoint.
 
-        If the light is broken, or too many steps in a row were skipped, the training must go back to its last checkpoint, and the reason is
-        returned. Otherwise "" is returned. Raises InputError if there is no checkpoint, or if the training failed again after it went back.
+        If light or exposures are not finite, or too many steps in a row were skipped, the training must go back to its last checkpoint: the
+        reason is returned. Otherwise "" is returned. Raises InputError if there is no checkpoint, or if this happens again afterwards.
         """
         total, in_a_row, taken = (int(count) for count in self._counts.tolist())
         worse, self._seen = total > self._seen, total

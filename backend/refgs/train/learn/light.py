@@ -23,28 +23,28 @@ MIRROR_VIEWS = 24  # views that tell which part of the light the object mirrors
 
 
 class MirroredLight(Part):
-    """Keep the `weight` of each texel in `mean_radiance`: the fraction of mirroring pixels that mirror it."""
+    """Keep the texels' weights (6·R²,) for `mean_radiance`: `weight` is larger for a texel that more pixels mirror, and sums to 1."""
 
     name, saved = "light", ("weight",)
     weight: Tensor | None = None
 
 
 def start_value(state: State) -> float:
-    """Return the learned value of all texels of the light at the start. The activation turns it into the radiance in the settings."""
+    """Return the raw value at which all texels of the light start. Its activation is the setting `environment.radiance`."""
     return state.method.light.raw(state.settings.environment.radiance)
 
 
 def first_resolution(settings: Settings) -> int:
-    """Return how many texels the cubemap has along a side at first.
+    """Return how many texels the light's cubemap has along a side at first: half the final number, but at least LEAST_SIDE.
 
-    It is half the final resolution: each texel is then seen more often and learns sooner.
+    With fewer texels, each one is seen more often and learns sooner.
     """
     return max(settings.environment.resolution // 2, LEAST_SIDE)
 
 
 @torch.no_grad()
 def refine(state: State, step: Step) -> None:
-    """Double the cubemap's texels along a side, if it has fewer than in the settings."""
+    """Double the texels along a side of the light's cubemap, if they are fewer than `environment.resolution`."""
     side = math.isqrt(len(state.learned["environment"]) // 6)
     if side >= state.settings.environment.resolution:
         return
@@ -55,7 +55,7 @@ def refine(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def coarsen(state: State, side: int) -> None:
-    """Reduce the cubemap to `side` texels along a side by averaging texels."""
+    """Reduce the light's cubemap to `side` texels along a side by averaging texels."""
     state.learned.learn("environment", cubemap.reduced(state.learned["environment"], side), by_row=False)
 
 

@@ -24,8 +24,8 @@ SUMS = 3  # sums of each row or block: loss, pixels with a surface, squared erro
 class Objective(NamedTuple):
     """Hold the training loss of one view, and the mean squared error of its picture.
 
-    `loss` is a differentiable scalar. `square` is the mean squared error, of the picture and the photo clipped to 0..1. If the photo is a
-    crop, both are averaged over the whole photo, as if pixels outside the crop had no error.
+    `loss` is a differentiable scalar. `square` is the mean squared error between the picture and the photo, both clipped to 0..1. If the
+    photo is a crop, errors are averaged over the whole photo, as if pixels outside the crop had no error.
     """
 
     loss: Tensor
@@ -119,10 +119,10 @@ class _Objective(Function):
 
 
 def departure(exposure: Tensor) -> Tensor:
-    """Compute a loss that keeps a photo's exposure near one. `exposure` (K,) is a row of `State.exposures`.
+    """Compute a loss that keeps a photo's exposure near one. `exposure` (K,) are its learned weights (see `exposures.exposure`).
 
-    Without this loss, a brighter light with shorter exposures would fit the photos as well. The loss is the sum of the absolute values,
-    smoothed near zero. Absolute values, unlike squares, let a few photos differ strongly without moving the others.
+    Without this loss, a brighter light with shorter exposures would fit the photos as well. The loss is the sum of the weights' absolute
+    values, smoothed near zero. Absolute values, unlike squares, let a few photos differ strongly without moving the others.
     """
     return (torch.sqrt(exposure * exposure + ROUND_OFF**2) - ROUND_OFF).sum()
 
@@ -147,13 +147,13 @@ def objective(
     - Smoothness: ‖∇N‖ exp(−‖∇C‖) where the surface is opaque. C is the photo's colour, and ∇ takes forward differences. Metallic and
       roughness are smoothed with a weight of their own, because photos do not determine them where the mirrored light is uniform.
     - Mask: |α − mask|.
-    - Light: the squared difference between `light` (3,), the mean radiance that the object mirrors, and grey. Without this term, white
-      balance drifts, because warm metal under neutral light looks almost like neutral metal under warm light.
+    - Light: how far `light` (3,), the mean radiance that the object mirrors, is from grey: mean((light / mean(light) − 1)²). Without this
+      term, white balance drifts, because warm metal under neutral light looks almost like neutral metal under warm light.
     - Metallic m: m (1 − m), because real surfaces are either metal or not. The weight grows with the square of `progress`, because early in
       the training it is unknown which surfaces are metal.
     - Dark metals: m times how much darker the surfel is than clean metals. A dark metal looks like dark glass.
-    - Roughness: how much it exceeds 0.3. Where photos are clipped or show nothing bright, a blurred reflection fits as well as a sharp one,
-      even if normals are wrong.
+    - Roughness: how much it exceeds 0.3. Without this term, it would grow where photos are clipped or show nothing bright: a blurred
+      reflection fits there as well as a sharp one, even if normals are wrong.
     """
     material = rendering.material if max(weights.metallic, weights.dark, weights.even, weights.matte) > 0 else None
     maps = rendering.color, rendering.normal, rendering.blended_depth, rendering.alpha, material

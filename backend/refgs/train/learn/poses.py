@@ -30,10 +30,10 @@ BETTER = 0.5  # refined poses must come below this fraction of the given poses' 
 
 
 class Poses(Part):
-    """Remember the poses of the views.
+    """Remember the poses of the V training views.
 
-    `given` are the views' cameras in the capture. `values` (V, 6) are the poses; None means that the given cameras are used. `judged` tells
-    whether `judge` has already compared the given and the refined cameras.
+    `given` are the views' cameras in the capture. `values` (V, 6) are the poses, as in `render.align`; None: the given cameras are used.
+    `judged` tells whether `judge` has already compared the given and the refined cameras.
     """
 
     name, saved = "poses", ("judged", "values")
@@ -43,7 +43,7 @@ class Poses(Part):
     def start(self, state: State) -> None:
         """Give every view a zero pose, if poses are to be refined.
 
-        Poses are refined if the setting `cameras.poses` is "on", or if it is "auto" and features contradict the given cameras.
+        Poses are refined if the setting `cameras.poses` is "on", or if it is "auto" and matched features contradict the given cameras.
         """
         self.given, wanted = [view.camera for view in state.views], state.settings.cameras.poses
         if wanted == "auto":
@@ -66,7 +66,7 @@ class Poses(Part):
             self.move(state, view)
 
     def move(self, state: State, view: int) -> None:
-        """Move a view's camera by its pose."""
+        """Set a view's camera to the given one, moved by the view's pose."""
         camera = self.given[view]
         if self.values is not None:
             camera = posed(camera, self.values[view], state.capture.centre, state.capture.radius)
@@ -100,9 +100,9 @@ def remove_common(state: State, step: Step) -> None:
 
 
 def judge(state: State, step: Step) -> None:
-    """Compare the refined cameras with the given ones, once. Keep the refined ones only if features fit them far better.
+    """Compare the refined cameras with the given ones, once. Keep the refined ones only if matched features fit them far better.
 
-    This is done only if the setting `cameras.poses` is "auto".
+    The features are matched between photos. This is done only if the setting `cameras.poses` is "auto".
     """
     poses = state.part(Poses)
     if poses.values is None or state.settings.cameras.poses != "auto" or poses.judged:

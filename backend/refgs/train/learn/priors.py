@@ -1,8 +1,8 @@
-"""Use normals and depth that other programs guessed from single photos, early in the training.
+"""Use priors early in the training: normals and depth that other programs guessed from single photos.
 
-Photos of mirrors and hollow shapes can also be explained by wrong shapes, such as the visual hull's lid over a bowl. A network that guesses
-from one photo knows what bowls look like. Its guess is wrong in detail, and its depth has no scale. So these loss terms saturate, and fade
-to zero: in the end, only the photos count.
+Photos of mirrors and hollow shapes can also be explained by wrong shapes: the visual hull closes a bowl with a lid, for example. A network
+that guesses from one photo knows what bowls look like. Its guess is wrong in detail, and its depth has no scale. So the loss terms of
+priors saturate, and fade to zero: in the end, only the photos count.
 
 Programs write normals with different axes. The axes that agree best with the surfels at the start are used for all views. Depth is fitted
 to the rendered depth each time that it is used, with one scale and one shift per view.
@@ -42,9 +42,9 @@ Maps = dict[int, tuple[Tensor, Camera]]
 class Priors(Part):
     """Hold the normal and depth priors of the training views, which other programs estimated from the photos.
 
-    Both fields map a view's number to a map and the photo's camera for the map's size. `normals` are int8 (H, W, 3) in the camera's axes.
-    `depth` is float32 (H, W) with unknown scale and shift. If `disparity` is true, all depth maps are disparities; otherwise none is. A
-    value of 0 means unknown.
+    `normals` and `depth` are dicts: a view's index gives its map, and the photo's camera in the map's size. Maps of normals are int8
+    (H, W, 3): unit vectors in the camera's axes, times CODE. Maps of depth are float32 (H, W) with unknown scale and shift. If `disparity`
+    is true, they all hold disparities. A value of 0 means unknown.
     """
 
     name = "priors"
@@ -82,9 +82,9 @@ def load(state: State) -> None:
 
 
 def loss(state: State, step: Step) -> Tensor | None:
-    """Compute the loss of the view's priors. Return None if it has none, or if they have faded.
+    """Compute the loss of the priors of this step's view. Return None if the view has no priors, or if priors have faded to zero.
 
-    As in `objective`, the loss is a mean over the pixels of the whole photo.
+    The loss is a scalar: a mean over the pixels of the whole photo, also if only a crop is rendered.
     """
     view, rendering, photo = step.view, step.rendering, step.photo
     weight, priors = state.settings.loss.prior * fade(step.progress), state.part(Priors)
@@ -117,10 +117,10 @@ def normals_loss(rendering: Rendering, photo: Photo, codes: Tensor, camera: Came
 def depth_loss(
     rendering: Rendering, photo: Photo, guessed: Tensor, camera: Camera, disparity: bool, radius: float
 ) -> Tensor:
-    """Compute how far rendered depth is from guessed depth or disparity (H, W), scaled and shifted to fit best: a scalar.
+    """Compute how far rendered depth is from guessed depth: a scalar. The guess is first scaled and shifted to fit best.
 
-    Guesses are 0 where not known. `camera` is the photo's camera in the size of the guess. The loss of a pixel saturates: it is r² / (r² +
-    FAR²), where r is the distance in scene radii.
+    `guessed` (H, W) is depth, or disparity if `disparity` is true; 0 where not known. `camera` is the photo's camera in the size of the
+    guess. The loss of a pixel saturates: it is r² / (r² + FAR²), where r is the difference in units of `radius`, the scene's radius.
     """
     guessed, depth = at_pixels(guessed, camera, photo.camera), rendering.depth
     counts = _counts(rendering, photo) * (guessed > 0)
@@ -130,7 +130,7 @@ def depth_loss(
 
 
 def at_pixels(values: Tensor, camera: Camera, pixels: Camera) -> Tensor:
-    """Look up a map (H, W, …) of `camera` at the pixels of the camera `pixels`. Returns the nearest values.
+    """Resample a map (H, W, …) of `camera` to the pixels of another camera, `pixels`. Returns the nearest values.
 
     Both cameras have the same pose. `pixels` may have another size, or be a crop.
     """
@@ -163,7 +163,7 @@ def fitted(guessed: Tensor, depth: Tensor, counts: Tensor, disparity: bool, radi
 
 
 def axes_of(pairs: Iterable[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor | None, float]:
-    """Find the axes of guessed normals. Each of `pairs` has three sets of unit vectors (P, 3) for the view of one camera:
+    """Find the axes of guessed normals. Each of `pairs` has three sets of unit vectors (P, 3) for P pixels of one view:
 
     - the surface's normals, in the camera's axes (x right, y down, z forward)
     - the guessed normals, as they are in the file
@@ -185,13 +185,13 @@ def axes_of(pairs: Iterable[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor | No
 
 
 def _with_axes(state: State, normals: Maps) -> Maps:
-    """Turn the maps of normals to the axes of their cameras. Return {} if their own axes cannot be told from the surfels' normals."""
+    """Turn the maps of normals to the axes of their cameras. Return {} if the surfels' normals do not tell in which axes the files are."""
     if not normals:
         return {}
     turn = split_similarity(state.capture.to_capture)[1]
 
     def to_camera(view: int) -> Tensor:
-        """Return the rotation (3, 3) from the capture's world to the view's camera."""
+        """Return the rotation (3, 3) from the world of the capture's files to the view's camera."""
         return torch.from_numpy(state.views[view].camera.world_to_camera[:3, :3] @ turn.T).to(state.device).float()
 
     def pairs() -> Iterable[tuple[Tensor, Tensor, Tensor]]:
@@ -263,16 +263,16 @@ def _with_kind(state: State, depth: Maps) -> tuple[Maps, bool]:
 
 
 def _counts(rendering: Rendering, photo: Photo) -> Tensor:
-    """Return how much each pixel (H, W) counts: the mask's alpha where the surface is opaque, else 0."""
+    """Return each pixel's weight (H, W) in a loss: the mask's alpha, 0..1, where the surface is opaque, else 0."""
     opaque = (rendering.alpha.detach() > SOLID).float()
     return opaque if photo.mask is None else opaque * (photo.mask.float() / 255)
 
 
 def _saturating(error: Tensor, half: float, counts: Tensor, photo: Photo) -> Tensor:
-    """Compute a saturating loss: the sum of error / (error + half), weighted by `counts`, divided by the number of pixels of the whole
-    photo.
+    """Compute a saturating loss: Σ counts · error / (error + half), divided by the number of pixels of the whole photo.
 
-    An error equal to `half` gives a loss of 1/2. Much larger errors give nearly 1, so that wrong priors have a limited effect.
+    `counts` (H, W) are weights of pixels. An error equal to `half` gives a loss of 1/2. Much larger errors give nearly 1, so that wrong
+    priors have a limited effect.
     """
     rows, columns = photo.whole or photo.image.shape[:2]
     return (counts * error / (error + half)).sum() / (rows * columns)

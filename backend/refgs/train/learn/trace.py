@@ -25,7 +25,7 @@ MESH_VIEWS = 24  # views from which the mesh is fused, at least; all, if there a
 
 
 class TracedMesh(Part):
-    """Keep the mesh on which inter-reflection is traced, `state.occluder`, in checkpoints."""
+    """Keep `state.occluder`, the mesh on which inter-reflection is traced, in checkpoints."""
 
     name = "occluder"
 
@@ -43,7 +43,7 @@ class TracedMesh(Part):
 
 @torch.no_grad()
 def make_mesh(state: State, step: Step) -> None:
-    """Make a mesh of the surfels, to trace rays on. Set `step.hidden` to the fraction of the object's pixels that mirror the object."""
+    """Make the mesh `state.occluder` of the surfels. Set `step.hidden` to the fraction of the object's pixels that mirror the object."""
     if why_not_traced(state):
         return
     with state.clock.part("visibility"):
@@ -74,7 +74,7 @@ def make_mesh(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def trace_received(state: State, step: Step) -> None:
-    """Trace which fraction of an unoccluded surface's irradiance each surfel receives. Done again for each new mesh."""
+    """Trace on the new mesh each surfel's `received`: its irradiance divided by that of an unoccluded surface."""
     if state.occluder is None or "received" not in state.learned:
         return
     traced = Surfels(*(value.cpu() for value in with_normals_last(state.surfels())))

@@ -51,10 +51,10 @@ class Shining(NamedTuple):
 
 @torch.no_grad()
 def change_seen(observations: Observations, wanted: Tensor) -> float:
-    """Measure how much the surface changes with the viewing direction: a cubic mean over the surfels `wanted` (N,).
+    """Measure how much the surface's colour changes with the viewing direction: a cubic mean over the surfels in the mask `wanted` (N,).
 
     A surfel's change is the standard deviation of its sRGB-encoded colour over the photos. Surfels are weighted by the pixels they cover. A
-    cubic mean lets a small part that changes much, such as a chrome handle, count more. Returns 0 if no photo shows the surfels well.
+    cubic mean lets a small part that changes much, such as a chrome handle, count more. Returns 0..1; 0 if no photo shows the surfels well.
     """
     usable = observations.usable
     count = usable.sum(dim=1).clamp_min(2)
@@ -68,7 +68,7 @@ def change_seen(observations: Observations, wanted: Tensor) -> float:
 
 @torch.no_grad()
 def shines_as_metal(observations: Observations, positions: Tensor) -> Shining:
-    """Find the surfels that change with the view as a coloured metal does.
+    """Find the surfels whose radiance changes with the view as that of a coloured metal does.
 
     A metal tints what it reflects: its radiance changes along its own colour. A dielectric's reflection has the light's colour, which is
     grey on average, whatever the dielectric's own colour is. The direction of change is the first principal axis of the linear radiance
@@ -98,7 +98,7 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Shining:
 
 @torch.no_grad()
 def falls_as_metal(observations: Observations, positions: Tensor, light: float) -> Tensor:
-    """Find the surfels (N,) of any colour whose radiance falls so far below its median in some photos that they must be metal.
+    """Find the surfels of any colour whose radiance falls so far below its median in some photos that they must be metal: a mask (N,).
 
     A dielectric has the same diffuse radiance in all photos, and mirrors only a twenty-fifth of the light. Highlights may make it far
     brighter, but without them it is hardly darker than its median. A metal is as dark as what it mirrors. `light` is the light's mean

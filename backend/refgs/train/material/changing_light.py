@@ -32,11 +32,11 @@ CELL = 0.15  # side of a grid's cells, in scene radii: models are fitted to half
 
 
 class Explained(NamedTuple):
-    """Hold which fraction of the variance of a surface's changes each model explains. The fraction is that of surfels left out of the fit.
+    """Hold which fraction (0..1) of the variance of a surface's changes each model explains, measured on surfels left out of the fit.
 
-    - `lit`: the light changes: for each photo, a linear function of the normal.
-    - `mirrored`: the surface mirrors: one function of the mirror direction, and an exposure for each photo.
-    - `both`: both models together.
+    - `lit`: the light changes. This model is a linear function of the normal for each photo.
+    - `mirrored`: the surface mirrors. This model is one function of the mirror direction, and an exposure for each photo.
+    - `both`: the sum of these two models.
 
     All are NaN if too few surfels are seen.
     """
@@ -47,7 +47,7 @@ class Explained(NamedTuple):
 
     @property
     def by_changes(self) -> bool:
-        """Tell whether the light changed: `lit` is clearly above `mirrored`, and mirroring explains hardly any of what `lit` leaves.
+        """Tell whether the light changed: `lit` is clearly above `mirrored`, and hardly below `both`.
 
         A high `lit` alone proves nothing: in a single photo, the mirror direction is nearly a function of the normal, too.
         """
@@ -66,9 +66,9 @@ class Explained(NamedTuple):
 
 @torch.no_grad()
 def explained(observations: Observations, positions: Tensor, radius: float, *parts: Tensor) -> list[Explained]:
-    """Measure how well a changing light explains the way that parts of a surface change from photo to photo, and how well mirroring does.
+    """Measure for some parts of a surface how well its changes from photo to photo are explained by a changing light, and by mirroring.
 
-    Changes and normals are averaged over neighbours. Each of `parts` (N,) is a mask of surfels, and gets one result. `radius` is the
+    Each of `parts` (N,) is a mask of surfels, and gets one result. Changes and normals are averaged over neighbours. `radius` is the
     scene's radius in world units.
     """
     near = neighbours(positions, SMOOTHED)
@@ -84,7 +84,8 @@ def explained(observations: Observations, positions: Tensor, radius: float, *par
 def _explained(observations: Observations, relative: Tensor, known: Tensor, cells: Tensor) -> Explained:
     """Fit the models to the changes `relative` (N, V) where they are `known` (N, V), and measure what they explain.
 
-    Changes are divided by the surfel's mean radiance. `cells` (N, 3) are positions in grid cells. The fit uses every second cell.
+    Changes are divided by the surfel's mean radiance. `cells` (N, 3) are positions in units of a grid's cells. The models are fitted in
+    every second cell, and measured in the others.
     """
     chosen = known.any(dim=1).nonzero()[:, 0]
     if len(chosen) < LEAST_SURFELS:
@@ -109,7 +110,7 @@ def _explained(observations: Observations, relative: Tensor, known: Tensor, cell
 
 
 def _unexplained(target: Tensor, columns: Tensor, weight: Tensor, fitted: Tensor) -> float:
-    """Fit `columns` to `target` by ridge regression where `fitted` is true. Return the mean squared residual elsewhere."""
+    """Fit `columns` (P, K) to `target` (P,) by ridge regression in the rows `fitted` (P,). Return the other rows' mean squared residual."""
     rows = columns[fitted] * weight[fitted, None]
     square = rows.T @ columns[fitted]
     ridge = RIDGE * square.diagonal().mean().clamp_min(1e-12) * torch.eye(len(square)).to(square)

@@ -27,10 +27,7 @@ def coloured_metal(surfels: Surfels) -> Tensor:
 
 @torch.no_grad()
 def even_out(state: State, step: Step) -> None:
-    """Average base colour and roughness of coloured metal over neighbours.
-
-    Only neighbours of coloured metal count. The more opaque they are, the more they count.
-    """
+    """Average the base colour and roughness of coloured metal over neighbouring surfels of coloured metal, weighted by their opacity."""
     if not state.part(Metals).found:
         return
     surfels = state.surfels()

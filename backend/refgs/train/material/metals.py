@@ -1,10 +1,10 @@
-"""Set a first metallic for surfels by how they change with the viewing direction.
+"""Set a first metallic for surfels by how their colour changes with the viewing direction.
 
-Paint explains photos of a rough or embossed metal about as well as metal does. Training starts near paint, so it would stay there. The tint
-of a surfel's change with the view tells metal from paint before normals and light are known.
+Paint explains photos of a rough or embossed metal about as well as metal does. Training starts near paint, so it would stay there. A metal
+tints what it mirrors. So the tint of a surfel's changes tells metal from paint before normals and light are known.
 
-If nearly all of the surface shines as coloured metals do, metallic no longer learns. Photos alone would turn parts of the surface back into
-paint, which explains the photos about as well.
+If nearly all of the surface changes as coloured metals do, metallic is held: it no longer learns. Otherwise, training would turn parts of
+the surface back into paint, which explains the photos about as well.
 """
 
 import torch
@@ -29,7 +29,7 @@ HELD = Kinds(metal=0.98, paint=0.002)  # metallic that does not learn, in the or
 
 
 class Metals(Part):
-    """Remember in `found` whether photos or hints have told which surfels are metal."""
+    """Remember in `found` whether photos, or hints by the user, have already told which surfels are metal."""
 
     name, saved = "metals", ("found",)
     found = False
@@ -42,20 +42,21 @@ class Metals(Part):
 
 
 def find_metals(state: State, step: Step) -> None:
-    """Once, early in the training, raise the metallic of surfels whose colour changes with the view as only that of metals does.
+    """Raise the metallic of surfels whose colour changes with the view as only that of metals does. Done once, early in the training.
 
     `shines_as_metal` finds coloured metals, and `falls_as_metal` finds metals of any colour. Two findings rule metal out, and lower the
     metallic that was learned so far:
 
     - The changes fit a light that differs between photos far better than they fit mirroring (see `changing_light.explained`). Then
       nothing is metal.
-    - The changes of coloured surfels fit neither of the two. Then nothing coloured is metal. Fur is an example: it hides and shows what is
-      below it, which has the same colour.
+    - The changes of coloured surfels fit neither a changing light nor mirroring. Then nothing coloured is metal. Fur is an example: from
+      some views, it hides what is below it, which has the same colour.
 
-    If nearly all surfels shine as coloured metals do, all are metal from then on (see `hold`). Faint shining is enough for this if
-    their changes fit mirroring. Otherwise, surfels that are not found keep their metallic, which started low, as that of a dielectric.
+    If nearly all surfels change as coloured metals do, all are metal from then on (see `hold`). Faint changes are enough for this if they
+    fit mirroring. Otherwise, surfels that are not found keep their metallic, which started low, as that of a dielectric.
 
-    If most of the coloured surface shines, dark parts may be metal as well, such as patina. Then the loss term `loss.dark` ends.
+    If most of the coloured surface changes as metals do, dark parts may be metal, too, such as patina. So dark metals are no longer
+    penalised (`loss.dark` is 0 from then on).
 
     Schedules that propagate normals do not call this function. Propagation finds the metals there, as in the paper.
     """
@@ -94,8 +95,8 @@ def find_metals(state: State, step: Step) -> None:
 def judge(state: State, step: Step) -> None:
     """Judge again which surfels are metal, by what they mirror (see `mirrored`, `same_material`).
 
-    A surfel that is taken for paint becomes metal if it belongs to the same piece as metals do. It takes their base colour and roughness.
-    An example is the lower half of a ball on a table: it mirrors evenly, so it has learned the mirrored table as its own colour.
+    A surfel that is taken for paint becomes metal if a smooth surface connects it to metals. It takes their base colour and roughness. An
+    example is the lower half of a ball on a table: it mirrors only the table, so it has learned the table's colour as its own.
 
     A metal becomes paint if it looks the same from everywhere, although a metal would mirror different things. Training can still change
     the metallic that is set here.
@@ -122,11 +123,11 @@ def judge(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
-    """Measure where photos do not tell metal from paint (see `same_material.doubt`). Announce the fraction of the surface.
+    """Measure each surfel's doubt: how little the photos tell metal from paint there, 0..1 (see `same_material.doubt`).
 
-    Returns the doubt of each surfel (N,) in 0..1, and facts for metrics.json. `part` is the fraction of the surface whose doubt is at least
-    DOUBTFUL. `what` is the text that is announced if that fraction is more than TOLD. Returns None if photos do not decide what is
-    metal: without a light, without specular shading, or without a mask of each photo. Surfels whose metallic is held are not in doubt.
+    Returns the doubt (N,), and facts for metrics.json: `part` is the fraction of the surface whose doubt is at least DOUBTFUL. If it is
+    more than TOLD, it is announced, and `what` is the text. Surfels whose metallic is held (see `hold`) have doubt 0. Returns None if
+    photos do not decide what is metal: without a light, without specular shading, or without a mask of each photo.
     """
     if not state.from_hull or not metals_decidable(state, state.iteration):
         return None
@@ -145,7 +146,7 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
 
 @torch.no_grad()
 def hold_as(state: State, kinds: torch.Tensor) -> None:
-    """Hold the metallic of surfels from now on (see `hold`). `kinds` (N,) are indices in `hints.KINDS`, or −1 for surfels that learn."""
+    """Set and hold the metallic of surfels by their `kinds` (N,): 0 for metal, 1 for paint, −1 for surfels whose metallic still learns."""
     for number in range(len(HELD)):
         state.learned["metallic"][kinds == number] = raw_metallic(HELD[number])
     state.learned["held"].copy_(kinds >= 0)

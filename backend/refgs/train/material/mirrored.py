@@ -29,7 +29,7 @@ BRIGHTEST = 20.0  # largest radiance of a mirrored lamp: photos clip it
 
 
 class Fit(NamedTuple):
-    """Hold how well each of N surfels is explained, together with its neighbours.
+    """Hold how well metal and paint explain what photos show of each of N surfels and its neighbours.
 
     - `ratio` (N,): the squared error as a metal, divided by that as paint
     - `slope` (N,): how much the shown radiance grows per unit of mirrored radiance, by a straight line fitted over the photos
@@ -92,10 +92,10 @@ def _at_vertices(surfels: Surfels, seen: Seen, mesh: Mesh) -> Tensor:
 
 
 def _fit(seen: Seen, mirrored: Iterable[list[Tensor]], positions: Tensor) -> Fit:
-    """Fit both materials to all photos, for each of ROUGHNESSES. Keep the best metal and the best paint.
+    """Fit metal and paint to all photos, for each of ROUGHNESSES. Keep each surfel's best metal and best paint.
 
-    Let R be what a surfel mirrors. A metal of reflectance s shows (s FG0 + FG1) R. Paint of diffuse radiance c shows c + F R. FG0, FG1 and
-    F are the entries 0, 1 and 3 of `brdf.reflectance_table`. Both fits need only sums over the photos.
+    Let R be what a surfel mirrors: `mirrored`, from `_mirrored`. A metal of reflectance s shows (s FG0 + FG1) R. Paint of diffuse radiance
+    c shows c + F R. FG0, FG1 and F are the channels 0, 1 and 3 of `brdf.reflectance_table`. Both fits need only sums over the photos.
     """
     near, count = neighbours(positions, NEIGHBOURS), len(positions)
     names, shape = ("rest", "both", "power", "paint", "first"), (len(ROUGHNESSES), count, 3)

@@ -29,7 +29,7 @@ GRAZING = 0.15  # least cosine between normal and camera; at more grazing angles
 
 
 class Kinds(NamedTuple):
-    """Hold one number for metal surfaces and one for painted surfaces."""
+    """Hold one number for metal surfaces and one for painted surfaces, such as two thresholds."""
 
     metal: float
     paint: float
@@ -39,9 +39,9 @@ class Observations(NamedTuple):
     """Hold what some photos show of each of N surfels.
 
     - `mean` (N, 3): linear radiance, the same in all V photos, that explains them best.
-    - `change` (N, V, 3): how far the radiance in a photo is from `mean`.
-    - `pixels` (N, V): the surfel's blending weights in a photo, summed over its pixels; 0 where it is not usable.
-    - `clipped` (N, V): the part of `pixels` where the photo is clipped, so that its colour is not known.
+    - `change` (N, V, 3): how far the radiance in a photo is from the model's: `mean` times the photo's exposure (see `observe_changes`).
+    - `pixels` (N, V): the surfel's blending weights in a photo, summed over its pixels; 0 if seen at a grazing angle.
+    - `clipped` (N, V): the fraction of `pixels` where the photo is clipped, so that its colour is not known.
     - `normal` (N, V, 3): the surfel's normal towards the camera, in the frame in which the light stands still.
     - `towards` (N, V, 3): the direction from the surfel to the camera, in that frame.
     """
@@ -64,7 +64,7 @@ class Seen(NamedTuple):
     """Hold what V photos show of each of N surfels, on the CPU.
 
     - `radiance` (N, V, 3): linear, without the photo's exposure
-    - `weight` (N, V): the surfel's blending weights, summed over its pixels; 0 where the surfel is clipped, hardly seen or grazing
+    - `weight` (N, V): the surfel's blending weights, summed over its pixels; 0 where it is hardly seen, clipped, or at a grazing angle
     - `pixels` (N,): the surfel's blending weights, summed over its pixels in all photos, also where `weight` is 0
     - `mean` (N, 3): the mean radiance over the pixels that are counted in `pixels`
     - `normal` (N, V, 3): the unit normal that is blended at its pixels
@@ -88,11 +88,11 @@ class Seen(NamedTuple):
 def observe_changes(state: State) -> Observations:
     """Compare some training photos with a model in which each surfel looks the same from everywhere.
 
-    The model's radiance is fitted to the photos, with an exposure for each photo. The model knows that surfels hide each other, and that
-    several surfels share a pixel.
+    The surfels' radiance is fitted to the photos, with an exposure for each photo. The model is rendered: surfels occlude each other, and
+    several of them share a pixel.
 
-    If the light turns with the camera, the diffuse light on a matte surface changes from photo to photo, too. The model then also has its
-    irradiance: spherical harmonics of degree 2 of the normal in the camera's frame (Ramamoorthi and Hanrahan 2001).
+    If the light turns with the camera, matte surfaces change from photo to photo, too. Then a factor for the irradiance is also fitted:
+    spherical harmonics of degree 2 of the normal in the camera's frame (Ramamoorthi and Hanrahan 2001).
     """
     surfels = Surfels(*(value.detach() for value in state.surfels()))
     photos = [state.photo(view) for view in probe.spread_views(state, OBSERVED_VIEWS)]
@@ -164,7 +164,8 @@ def _residuals(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Sum the photos' differences from the model over each surfel's pixels, weighted by its blending weights.
 
-    Returns the sums (N, V, 3), the sums of the weights (N, V), and the sums of the weights of clipped pixels (N, V).
+    The model shows a surfel in a photo as `factor` (N, V) times `mean` (N, 3). Returns the sums (N, V, 3), the sums of the weights (N, V),
+    and the sums of the weights of clipped pixels (N, V).
     """
     sums = []
     for number, photo in enumerate(photos):
@@ -183,8 +184,9 @@ def _residuals(
 def _fitted(factor: Tensor, totals: Tensor, pixels: Tensor, mean: Tensor, light: Tensor | None) -> Tensor:
     """Correct each surfel's `factor` (N, V) in each photo by the residuals. In the model, a photo shows `factor` times `mean` (N, 3).
 
-    `totals` and `pixels` are the residuals and weights from `_residuals`. A factor holds the photo's exposure, corrected by a median, which
-    highlights hardly move. With `light` (N, V, 9), harmonics of the normals, it also holds the diffuse light. The result's mean is 1.
+    `totals` and `pixels` are the residuals and weights from `_residuals`. All factors of a photo contain its exposure. It is corrected by
+    the median over surfels, which highlights hardly move. With `light` (N, V, 9), harmonics of the normals, factors are also corrected by
+    the diffuse light. They are then scaled to a mean of 1.
     """
     brightness = mean.mean(dim=1)
     known = (pixels > LEAST_PIXELS) & (brightness > DARK)[:, None]
@@ -200,14 +202,14 @@ def _fitted(factor: Tensor, totals: Tensor, pixels: Tensor, mean: Tensor, light:
 
 
 def from_grey(colour: Tensor) -> Tensor:
-    """Return how far the chromaticities of linear colours (N, 3) are from grey: each channel's share of the sum, less 1/3."""
+    """Return how far the chromaticities of linear colours (N, 3) are from grey: each channel divided by the channels' sum, less 1/3."""
     return colour / colour.sum(dim=1, keepdim=True).clamp_min(1e-6) - 1 / 3
 
 
 def averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Average observations over each surfel's neighbours, as listed in `near` (N, K).
+    """Average observations over each surfel's neighbours. `near` (N, K) are the indices of these.
 
-    Returns the mean radiance (N, 3), how far each photo's radiance is from it (N, V, 3; 0 where unknown), and whether that is known (N, V).
+    Returns the averages of `mean` (N, 3) and of `change` (N, V, 3; 0 where unknown), and where the latter is known (N, V).
     """
     weight = observations.pixels * (observations.clipped < LEAST_CLIPPED) * (observations.pixels > LEAST_PIXELS)
     pixels = pooled(weight, near)
@@ -220,7 +222,7 @@ def averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def neighbours(positions: Tensor, most: int, of: Tensor | None = None) -> Tensor:
-    """Return the indices (M, K) of each surfel's nearest surfels, itself among them: K is `most`, or N if there are fewer.
+    """Return the indices (M, K) of the K surfels nearest to each surfel, itself included. K is `most`, or N if there are fewer.
 
     The mask `of` (N,) selects the surfels whose neighbours are returned. None selects all.
     """
@@ -232,7 +234,7 @@ def neighbours(positions: Tensor, most: int, of: Tensor | None = None) -> Tensor
 
 
 def pooled(values: Tensor, near: Tensor) -> Tensor:
-    """Sum the rows of `values` (N, …) over neighbours, as listed in `near` (M, K). Returns (M, …)."""
+    """Sum the rows of `values` (N, …) over neighbours, whose indices are `near` (M, K). Returns (M, …)."""
     total = values.new_zeros(len(near), *values.shape[1:])
     for column in near.T:
         total += values[column]

@@ -1,7 +1,7 @@
-"""Decide between metal and paint for whole surfaces: evidence about some surfels spreads to others of the same piece.
+"""Decide between metal and paint for whole pieces of the surface: evidence about some surfels of a piece spreads to the others.
 
-The model is a random walk with seeds (Grady 2006) on a graph of neighbouring surfels. Steps are likely along a smooth surface of one
-brightness. They are unlikely across a concave crease, where two objects or two parts touch.
+The model is a random walk with seeds (Grady 2006) on a graph of neighbouring surfels. Steps are likely within a piece: a smooth surface of
+one brightness. They are unlikely across a concave crease, where two objects or two parts touch.
 """
 
 from typing import NamedTuple
@@ -53,8 +53,8 @@ class Found(NamedTuple):
 def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
     """Find surfels that the training has taken for the wrong kind, metal or paint. The evidence is from photos (see `material.mirrored`).
 
-    Evidence for either kind spreads to neighbours over a surface. Where none arrives, surfels keep the kind that the training has found so
-    far. The kind found so far is no evidence, so it does not turn neighbours of the other kind.
+    Evidence for either kind spreads to neighbours over a surface. Where no evidence arrives, surfels keep the kind that the training has
+    found so far. This kind is no evidence: it does not spread to neighbours of the other kind.
     """
     graph, part, metal, paint = _evidence(surfels, seen, fit)
     was, none = (surfels.metallic > 0.5).numpy(), 1e-4
@@ -75,13 +75,13 @@ def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
 
 
 def doubt(surfels: Surfels, seen: Seen, fit: Fit) -> Tensor:
-    """Measure how little photos tell metal from paint, for each surfel: (N,) in 0..1. What the training has decided has no influence.
+    """Measure how little photos tell metal from paint, for each surfel: (N,) in 0..1. The metallic learned so far has no influence.
 
-    Doubt is 0 where photos show the kind clearly. It is 1 where hardly any pixel shows the surfel, or where photos show nothing about its
-    piece. Elsewhere it rises with the distance from surfels of the same piece whose kind photos show.
+    Doubt is 0 where photos show the kind clearly. It is 1 where hardly any pixel shows the surfel, or where photos show nothing about the
+    smooth piece of surface around it. Elsewhere it rises with the distance from surfels of the same piece whose kind photos show.
 
-    Let p be the probability of metal. Doubt is 1 − |2 p − 1|. The value 2 p − 1 solves the linear system of `decide`, with metals at 1 and
-    paint at −1. The weight OPEN draws all surfels to 0. (In `decide`, surfels are drawn to the kind that the training has found so far.)
+    Let p be the probability of metal. Doubt is 1 − |2 p − 1|. The value 2 p − 1 spreads as in `decide`, from evidence for metal (1) and for
+    paint (−1). The weight OPEN draws all surfels to 0. (In `decide`, surfels are drawn to the kind that the training has found so far.)
     """
     graph, _, metal, paint = _evidence(surfels, seen, fit)
     return 1 - torch.from_numpy(_solve(graph, metal + paint + OPEN, metal - paint)).float().abs().clamp_max(1)
@@ -90,7 +90,7 @@ def doubt(surfels: Surfels, seen: Seen, fit: Fit) -> Tensor:
 def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray, np.ndarray]:
     """Return the Laplacian (N, N) of neighbouring surfels, which surfels can be judged (N,), and evidence for metal and for paint (N,).
 
-    A surfel can be judged if photos show it in more than FRINGE pixels. Evidence lies between 0, for none, and SURE.
+    A surfel can be judged (1, else 0) if photos show it in more than FRINGE pixels. Evidence is between 0, none, and SURE, the strongest.
     """
     graph, part = _laplacian(surfels.positions, seen), (seen.pixels > FRINGE).double().numpy()
     ratio = np.asarray((fit.ratio.clamp(1e-3, 1e3).log().double() * fit.seen).numpy())
@@ -113,7 +113,7 @@ def _solve(graph: sparse.csr_matrix, weight: np.ndarray, weighted: np.ndarray) -
 
 
 def _laplacian(positions: Tensor, seen: Seen) -> sparse.csr_matrix:
-    """Return the Laplacian (N, N) of the graph of neighbouring surfels. Edges within one piece have the largest weights, up to 1."""
+    """Return the Laplacian (N, N) of a graph of neighbouring surfels. Edges on a smooth surface of one brightness weigh most, up to 1."""
     points, near = positions.double().numpy(), neighbours(positions, LINKED + 1)[:, 1:].numpy()
     count = len(points)
     one, other = np.repeat(np.arange(count), near.shape[1]), near.ravel()
