@@ -124,7 +124,7 @@ def choose_device(device: str, report: Report) -> str:
 
 
 def _less(settings: Settings) -> str:
-    """Return the advice for a full main memory: a text that names the settings to lower, with their present values."""
+    """Return the advice to a user whose main memory is full: a text that names the settings to lower, with their present values."""
     side, budget = settings.image.max_side, settings.surfels.budget
     parts = f"smaller photos (image.max_side, now {side}) or fewer surfels (surfels.budget, now {budget})"
     return f"close other programs and resume, or train into a new folder with {parts}"
@@ -156,9 +156,9 @@ def _check_unfinished(out: Path) -> None:
 
 
 def _read_capture(folder: Path, known: _Known, report: Report) -> "tuple[Capture, Effective]":
-    """Read the capture, and make masks for a new training if the capture has none. Return it, and the settings to train with.
+    """Read the capture, and make masks for a new training if the capture has none. Return the capture, and the settings to train with.
 
-    Raises InputError if it is not the capture that the known run was trained on.
+    Raises InputError if the run `known.run` was trained on another capture, or if files of the capture have changed since.
     """
     check_folder(folder)  # before numpy is imported
     from refgs.capture import read_files, to_run_frame
@@ -180,9 +180,9 @@ def _with_masks(
 ) -> "tuple[CaptureFiles, Effective]":
     """Make masks of a capture that has none, so that the object is trained alone.
 
-    Return the capture's files with their masks, and the settings. A box in the settings is moved with the capture's frame. If no object is
-    found, report a warning, and return files and settings unchanged. Raises InputError if the masks cannot be written: without them, the
-    object would be trained together with its surroundings, and look bad.
+    Return the capture's files with their masks, and the settings. New masks may change the coordinate frame of the training: a region box
+    in the settings is then converted to the new frame. If no object is found, report a warning, and return files and settings unchanged.
+    Raises InputError if the masks cannot be written: without them, the object would be trained together with its surroundings.
     """
     from refgs.capture.masks import ReadOnlyError, masks_folder, moved_region, with_masks
 
@@ -213,7 +213,7 @@ def _rounded(values: Iterable[float]) -> list[float]:
 def _trainer(
     asked: Asked, known: _Known, capture: "Capture", effective: Effective, plan: Plan, device: str, report: Report
 ) -> "Trainer":
-    """Make the trainer. Load the last checkpoint of a run that is resumed; create the run folder of any other."""
+    """Make the trainer. If a run is resumed, load its last checkpoint. Otherwise, create the run folder."""
     from refgs.train.fit import fitting
     from refgs.train.hints import continue_with_hints
     from refgs.train.trainer import Trainer
@@ -286,7 +286,10 @@ def _create_run(state: "State", preset: str, device: str) -> None:
 
 
 def _resumed(trainer: "Trainer") -> "Trainer":
-    """Load the last checkpoint of an interrupted training. Without one, the trainer stays ready to start over. Return the trainer."""
+    """Load the last checkpoint of an interrupted training, and return the trainer. Without a checkpoint, it is ready to start over.
+
+    Raises InputError if the run has hints but no checkpoint: such a run cannot start over.
+    """
     from refgs.formats.hints import FILE
 
     trainer.resume()
@@ -338,7 +341,7 @@ def _finish(trainer: "Trainer") -> float | None:
 
 
 def _remove_photos(out: Path) -> None:
-    """Remove the reduced photos from a run folder. Nobody may refer to them: Windows removes no mapped file."""
+    """Remove the reduced photos from a run folder. Drop all references to them before: Windows cannot remove a file that is mapped."""
     from refgs.capture import remove_cached
 
     remove_cached(out / PHOTOS)
@@ -363,7 +366,7 @@ def _most_memory() -> dict[str, int]:
 
 @contextmanager
 def _card_memory(what: str | None = None) -> Iterator[None]:
-    """Raise TryAgain if a `with` block runs out of GPU memory, or if the card fails.
+    """Raise TryAgain if a `with` block runs out of GPU memory, or if the GPU fails.
 
     `what` is the error message if memory runs out. If it is None, the message is that of `full_card`.
     """

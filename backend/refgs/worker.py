@@ -174,7 +174,10 @@ class Worker:
         self._closed = False  # the input has ended; commands may still be queued
 
     def listen(self, commands: IO[bytes]) -> None:
-        """Read commands from the input and queue them, until the input ends. Runs in its own thread."""
+        """Read commands from the input and queue them, until the input ends. Runs in its own thread.
+
+        `Keep` commands take effect at once. When the input ends, a job that cannot read commands is interrupted, unless `Keep` is on.
+        """
         try:
             for line in commands:
                 command = read_command(line)
@@ -210,8 +213,8 @@ class Worker:
     def send(self, event: str, facts: dict[str, Any]) -> None:
         """Write an event to the output as a JSON line.
 
-        If `facts` has a message `what`, its newlines are escaped. If nobody reads the output any more, writing fails. Jobs are then ended
-        as when the input ends, unless a `Keep` command with `on` = True has come.
+        If `facts` has a message `what`, its newlines are escaped. If writing fails because nobody reads the output any more, jobs are ended
+        as they are when the input ends, unless the last `Keep` command had `on` = True.
         """
         if "what" in facts:
             facts = facts | {"what": one_line(facts["what"])}
@@ -292,9 +295,9 @@ class Worker:
         return "done", facts | {"psnr": quality, "left_out": left_out}
 
     def _hear_training(self, event: str, facts: dict[str, Any]) -> None:
-        """Send an event of a training. While the training makes masks, also handle commands.
+        """Send an event of a training. While the training makes masks, also handle the commands that have come.
 
-        `_attend` handles commands only later, before each iteration.
+        Once iterations have begun, `_attend` handles commands. Raises _Ended if a command, or the end of the input, ends the training.
         """
         self.send(event, facts)
         while event == "progress" and "stage" in facts and not self._commands.empty():
@@ -340,7 +343,10 @@ class Worker:
         return False
 
     def _preview(self, state: State) -> None:
-        """Write a preview. A preview that cannot be written, for Windows replaces no open file, does not end the training."""
+        """Write a preview, and send its paths. If it cannot be written, warn once, and let the training continue.
+
+        On Windows, for example, a file that another program has open cannot be replaced.
+        """
         try:
             self.send("preview", write_preview(state))
         except OSError as error:

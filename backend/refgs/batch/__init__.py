@@ -1,1 +1,1 @@
-"""Train many captures: a list of them becomes command lines, which Ray runs on the cores and cards of one machine or a cluster."""
+"""Train many captures: a list of captures becomes command lines, which Ray runs on the CPUs and GPUs of one machine or a cluster."""

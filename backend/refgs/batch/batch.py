@@ -1,4 +1,4 @@
-"""Train all captures of a batch: hand their steps to the engine, follow them, and write a page about them."""
+"""Train all captures of a batch: hand their steps, such as `refgs train`, to Ray, follow them, and write a page about them."""
 
 import math
 import time
@@ -44,7 +44,10 @@ class _Run:
 
     @property
     def failed(self) -> tuple[str, Outcome] | None:
-        """Return the name and outcome of the first failed step, or None. Masks are skipped: if they matter, the training fails, too."""
+        """Return the name and outcome of the first failed step, or None. A failure of the step `masks` is ignored.
+
+        If the masks matter, the training fails, too.
+        """
         bad = [(name, found) for name in self.nodes if (found := self.outcomes.get(name)) and found.status]
         return next((pair for pair in bad if pair[0] not in OPTIONAL), None)
 
@@ -57,7 +60,7 @@ class _Run:
         return self.ended and all(outcome.status is not None for outcome in self.outcomes.values())
 
     def working(self) -> list[str]:
-        """List the steps that run now."""
+        """List the names of the steps that run now."""
         return [name for name, node in self.nodes.items() if name not in self.outcomes and node.step.running.exists()]
 
 
@@ -81,6 +84,8 @@ class Batch:
 
         `stop(done, total, seconds)` is called about once a second, with the numbers of ended and of all runs, and the seconds so far.
         If it returns True, all commands are ended; trainings write checkpoints first.
+
+        Raises InputError if the device is "cuda" and no machine has a CUDA card.
         """
         if self._device == "cuda" and not engine.cards:
             raise InputError("--device cuda: no machine here has a CUDA card that Ray knows of: take auto or cpu")
@@ -128,7 +133,10 @@ class Batch:
         write_rows(self._out / LOGS / ROWS, [self._row(run) for run in self._runs.values()])
 
     def _submit(self, job: Job, engine: Engine, card: int | None) -> None:
-        """Hand the steps of a training to the engine, except those that were done before."""
+        """Hand the steps of a training to the engine, except those that are done already, or that another training has handed over.
+
+        `card` is the memory of a CUDA card in bytes. If it is None, the training uses no card.
+        """
         run = _Run(job, {node.step.name: node for node in steps_of(job, self._out, self._device)})
         self._runs[job.name] = run
         settings = job.settings()
@@ -161,12 +169,12 @@ class Batch:
         self._report("ended", {"run": run.job.name, "what": f"{run.job.name}: {what}"})
 
     def _look(self, run: _Run) -> None:
-        """Read a run's metrics and find its first rendered test view, as far as the run folder has them."""
+        """Update a run's `figures` (its metrics) and `picture` (its first held-out view as rendered) from the files in its folder."""
         folder = self._out / run.job.name
         run.figures, run.picture = figures_of(folder), picture_of(folder)
 
     def _tell(self) -> None:
-        """Report how many runs have ended, and which steps the others are at. Write the table if WRITE_EVERY seconds have passed."""
+        """Report how many runs have ended, and which steps run now. Write rows.json if its last writing was WRITE_EVERY seconds ago."""
         working = []
         for run in self._runs.values():
             for name in run.working():
@@ -179,7 +187,10 @@ class Batch:
             self._write_rows()
 
     def _added(self) -> list[Job]:
-        """Read the captures again. Return the trainings that were added. If the list has an error, warn once of it and return []."""
+        """Read the list or folder of captures again. Return the trainings that were added, if the files of their captures are complete.
+
+        If the list has an error, warn of it once and return [].
+        """
         self._looked = time.monotonic()
         try:
             jobs = read_jobs(self._source, self._out, self._ask)
@@ -236,7 +247,7 @@ def _progress(run: Path) -> tuple[int, int]:
 
 
 def _settled(capture: Path) -> bool:
-    """Tell whether a capture's files are complete. Files that changed less than SETTLED seconds ago may still be being copied."""
+    """Tell whether a capture's files are complete: none has changed for SETTLED seconds. Until then, they may still be being copied."""
     try:
         changed = max(path.stat().st_mtime for path in [capture, *capture.rglob("*")])
     except OSError:

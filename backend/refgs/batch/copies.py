@@ -1,7 +1,8 @@
 """Copy a step's files to a machine that does not share the batch's folder, and copy back what the step makes.
 
-A copy has the same path as its original, because commands and run folders name files by their paths. The bytes go through Ray's object
-store.
+A step is one command of a batch, which Ray may run on any machine of a cluster. The originals are on the batch's machine, the one on which
+`refgs batch` runs. A copy has the same path as its original, because commands and run folders name files by their paths. The bytes go
+through Ray's object store.
 """
 
 import os
@@ -31,7 +32,7 @@ Listing = dict[str, tuple[int, int]]
 def list_files(root: Path) -> Listing:
     """List the files in the folder `root` and in the folders that it links to. Return {} if it does not exist.
 
-    If `root` is a file, the listing has only this file, under the name ".".
+    If `root` is a file, the listing has only this file, under the name ".". Lock files and half-written files are left out.
     """
     if root.is_file():
         return {".": _facts(root)}
@@ -53,22 +54,22 @@ def _facts(file: Path) -> tuple[int, int]:
 
 
 class Depot:
-    """Read and write files on the batch's machine for steps on other machines. Ray runs this as an actor on the batch's machine."""
+    """Read and write files on the machine on which `refgs batch` runs, for steps on other machines. It is an actor of Ray."""
 
     def __init__(self, mark: Path):
-        """Remember `mark`, a file. A machine that sees it shares the folder of the batch with this machine."""
+        """Remember the path of the file `mark`. A machine on which this file exists shares the batch's folder with this machine."""
         self._mark, self._tickets = mark, Counter()
 
     def begin(self, roots: tuple[Path, ...]) -> tuple[Path, dict[Path, int]]:
         """Register a step that writes to `roots`. Return the file `mark` (see `__init__`), and a ticket for each of `roots`.
 
-        To write there, a step needs the ticket. Earlier tickets are no longer valid: Ray has given up the steps that have them.
+        To write there, a step needs the ticket. Earlier tickets of a path are no longer valid: Ray has given up the steps that have them.
         """
         self._tickets.update(roots)
         return self._mark, {root: self._tickets[root] for root in roots}
 
     def listing(self, root: Path) -> Listing:
-        """List the files in a folder."""
+        """List the files in a folder, as `list_files` does."""
         return list_files(root)
 
     def read(self, file: Path, start: int) -> bytes:
@@ -78,13 +79,19 @@ class Depot:
             return opened.read(PART)
 
     def write(self, root: Path, ticket: int, name: str, parts: list[Any], time: int) -> None:
-        """Write a file completely or not at all. `parts` are references to its bytes, `time` is its time of change in nanoseconds."""
+        """Write the file `name` in the folder `root`, completely or not at all. Raises TryAgain if `ticket` is no longer valid.
+
+        `parts` are Ray references to its bytes, and `time` is its time of change in nanoseconds. `ticket` is from `begin`.
+        """
         self._check(root, ticket)
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         _write(root / name, map(_get, parts), time)
 
     def remove(self, root: Path, ticket: int, names: list[str]) -> None:
-        """Remove the originals of files that a step has removed. `names` are their paths in `root`; `ticket` is from `begin`."""
+        """Remove the originals of files that a step has removed. Raises TryAgain if `ticket`, which is from `begin`, is no longer valid.
+
+        `names` are their paths in the folder `root`.
+        """
         self._check(root, ticket)
         for name in names:
             (root / name).unlink(missing_ok=True)
@@ -96,13 +103,14 @@ class Depot:
 
 @contextmanager
 def at_hand(reads: tuple[Path, ...], writes: tuple[Path, ...], depot: Any) -> Iterator[None]:
-    """Copy files and folders of the batch's machine to this one for a `with` block, and copy back what the block writes.
+    """Copy files and folders from the batch's machine to this one for a `with` block, and copy back what the block writes.
 
-    Nothing is copied if `depot` is None, or if this machine shares the batch's folder. Otherwise, files are copied before the block, and
-    changes in `writes` are copied back during the block and after it. The copies stay for the next step: see `remove_copies`.
+    `depot` is the actor `Depot` on the batch's machine, on which `refgs batch` runs. Nothing is copied if it is None, or if this machine
+    shares the batch's folder. Otherwise, files are copied before the block, and changes in `writes` are copied back during the block and
+    after it. The copies stay for the next step: see `remove_copies`.
 
     Raises InputError if one of the paths exists here with other files than the original, and is not a copy of an earlier step. Raises
-    TryAgain if the batch's machine does not answer.
+    TryAgain if the batch's machine does not answer, or if the step was started again on another machine.
     """
     if depot is None:
         yield
@@ -140,15 +148,18 @@ def remove_copies(roots: list[Path], mark: Path) -> None:
 
 
 def _mark(root: Path) -> Path:
-    """Return the file that marks a folder of this machine as a copy.
+    """Return the path of the empty file that marks `root`, a file or folder on this machine, as a copy.
 
-    It lies beside the folder, because the folder's contents belong to the step.
+    It lies beside `root` and not in it, because the contents of a folder belong to the step.
     """
     return root.with_name(f".{root.name}.refgs-copy")
 
 
 def _fetch(root: Path, depot: Any) -> Listing:
-    """Update the copy of a file or folder from its original. Returns the listing of the original, which the copy then has, too."""
+    """Update the copy of a file or folder from its original. Returns the listing of the original, which then is that of the copy, too.
+
+    Raises InputError if there are other files at `root`, which are not a copy.
+    """
     there, here = _get(depot.listing.remote(root)), list_files(root)
     if not _mark(root).exists():
         if here and here == there:  # this folder is shared
@@ -186,7 +197,7 @@ def _write(file: Path, parts: Iterator[bytes], time: int) -> None:
 class _Back:
     """Copy changed files in folders of this machine back to their originals, in a thread, until `end` is called.
 
-    Ray stops a step by interrupting the main thread. The copying thread goes on, so the last changes are copied, too.
+    Ray stops a step by interrupting the main thread. The copying thread is not interrupted, so that the last changes are copied, too.
     """
 
     def __init__(self, folders: dict[Path, tuple[int, Listing]], depot: Any):

@@ -1,4 +1,4 @@
-"""Start Ray on this machine, or reach a cluster, and give it the steps of a batch."""
+"""Start Ray on this machine, or join a cluster, and let Ray run the steps of a batch (commands such as `refgs train`)."""
 
 import atexit
 import importlib.metadata
@@ -50,7 +50,7 @@ ALONE = {  # for a Ray of this machine alone, which nobody else may use
 
 
 class Engine:
-    """Run steps by Ray. A step starts when the steps that it waits for have ended, and a machine has cores, memory and cards free."""
+    """Run steps by Ray. A step starts when the steps that it waits for have ended, and a machine has cores, memory and a GPU free."""
 
     def __init__(self, ray: Any, cores: int):
         """Read the cores, memory and CUDA cards of the machines of a running Ray. `cores` is the number of cores of each step.
@@ -143,7 +143,7 @@ class Engine:
             return Outcome(TRY_AGAIN, what=f"its worker died {TRIES + 1} times ({why}): see that memory suffices")
 
     def cancel(self) -> None:
-        """Stop all steps. A running step writes a checkpoint before it ends."""
+        """Stop all steps. A training that runs writes a checkpoint before it ends."""
         for reference in self._steps:
             self._ray.cancel(reference, recursive=False)  # and not what copies their files back
 
@@ -174,7 +174,7 @@ class Engine:
 
 
 def _on(node: str) -> Any:
-    """Return Ray's strategy for a task that must run on one machine."""
+    """Return Ray's scheduling strategy for a task that must run on the machine with the node id `node`."""
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     return NodeAffinitySchedulingStrategy(node, soft=False)
@@ -216,10 +216,10 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
 
 
 def _keep_ignoring(ray: Any) -> None:
-    """Make Ray's shutdown ignore SIGTERM to its end. The caller has set SIGTERM to be ignored.
+    """Make this process ignore SIGTERM until the end of Ray's shutdown. The caller has set SIGTERM to be ignored already.
 
-    But when Ray closes its log, it restores the system's handler of SIGTERM, which ends the process. So this function lets Ray set
-    SIGTERM to be ignored again, before Ray ends its own processes.
+    But when Ray closes its log, it restores the system's handler of SIGTERM, which ends the process. So this function makes Ray set SIGTERM
+    to be ignored once more, just before Ray ends its own processes.
     """
     node = ray._private.worker._global_node
     if node is None or threading.current_thread() is not threading.main_thread():
@@ -255,7 +255,7 @@ def _signals(handler: Any) -> Iterator[None]:
 def _make_folder() -> Path:
     """Make a folder for Ray's sockets and logs, which is removed at exit. Remove the folders that killed batches have left.
 
-    No other user can open it. Ray lets all users write in its own folder, which is therefore in this one.
+    Only this user can open it. Ray's own folder, in which Ray lets all users write, is inside it and therefore protected.
     """
     parent = Path("/tmp" if os.name == "posix" else tempfile.gettempdir())  # names of sockets must be short
     for old in parent.glob(f"{FOLDERS}*"):
@@ -271,7 +271,7 @@ def _make_folder() -> Path:
 
 
 def _remove(folder: Path, lock: FileLock) -> None:
-    """Remove a batch's folder. Ray's processes, which may still be ending, write in it: try for some seconds."""
+    """Remove a batch's folder. Try for TIDY seconds, because Ray's processes may still be ending, and write in it."""
     until = time.monotonic() + TIDY
     while (folder / RAY).exists() and time.monotonic() < until:
         shutil.rmtree(folder / RAY, ignore_errors=True)
@@ -281,7 +281,10 @@ def _remove(folder: Path, lock: FileLock) -> None:
 
 
 def _is_left(folder: Path) -> bool:
-    """Tell whether a folder was made by `_make_folder` long ago, for this user. Batches that ended badly may have left no lock in it."""
+    """Tell whether a folder may be left from a killed batch: it looks as `_make_folder` made it, is this user's and over NEW seconds old.
+
+    A younger folder may belong to a batch that has not locked it yet. The caller tests the lock.
+    """
     facts = folder.stat()
     own = not hasattr(os, "getuid") or facts.st_uid == os.getuid()
     return own and time.time() > facts.st_mtime + NEW and {file.name for file in folder.iterdir()} <= {LOCKED, RAY}
@@ -311,7 +314,7 @@ def _import_ray(cluster: bool) -> Any:
 
 
 class _NoPaths(list):
-    """List of folders in which workers look for modules. It stays empty: Ray adds the current folder, where captures may be."""
+    """List of folders in which workers look for modules. It stays empty: Ray would add the current folder, where captures may be."""
 
     def extend(self, _: Any) -> None:
         pass

@@ -14,7 +14,7 @@ OPTIONAL = ("masks",)  # steps whose failure counts only if the training fails, 
 
 
 class Node(NamedTuple):
-    """Hold a step, the names of the earlier steps that must succeed, and the names of earlier steps that may fail."""
+    """Hold a step and the names of the steps that it waits for: those in `after` must succeed, those in `may_fail` need not."""
 
     step: Step
     after: tuple[str, ...] = ()
@@ -22,7 +22,7 @@ class Node(NamedTuple):
 
 
 def steps_of(job: Job, out: Path, device: str) -> list[Node]:
-    """List the steps of a training into `out`. A step comes after all steps that it waits for.
+    """List the steps of a training whose run folder is made in `out`. A step comes after all steps that it waits for.
 
     The step `masks` may fail. The training then reconstructs everything that the photos show. Steps never work in the same run folder at
     the same time: a step that locks the folder removes half-written files, because it takes them for leftovers of killed processes.

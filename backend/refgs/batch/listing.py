@@ -51,7 +51,10 @@ class _List(Ask):
 
 
 class Job(NamedTuple):
-    """Describe a training of the batch: its `name` is that of the run folder, `capture` the capture's folder."""
+    """Describe a training of the batch: `name` is that of its run folder, `capture` the capture's folder, and `ask` holds its options.
+
+    `capture_name` is the same for all trainings of a capture, which share the steps that find cameras and make masks.
+    """
 
     name: str
     capture: Path
@@ -66,8 +69,8 @@ class Job(NamedTuple):
 def read_jobs(source: Path, out: Path, ask: Ask) -> list[Job]:
     """Read the trainings of a batch from a list or from a folder of captures, and check them.
 
-    `ask` says how to train where the list does not. Raises InputError if a capture is listed twice, if two trainings would have one run
-    folder, if a folder is missing, if lists include each other in a circle, or if settings are wrong.
+    `ask` holds the options of the command line, which apply where the list has none. Raises InputError if a capture is listed twice, if two
+    trainings would have one run folder, if a folder is missing, if lists include each other in a circle, or if settings are wrong.
     """
     jobs = list(_jobs_of_folder(source, out, ask) if os.path.isdir(source) else _jobs_of_list(source, ask, ()))
     if not jobs:
@@ -94,7 +97,7 @@ def _jobs_of_folder(source: Path, out: Path, ask: Ask) -> Iterator[Job]:
 def _jobs_of_list(file: Path, ask: Ask, above: tuple[Path, ...]) -> Iterator[Job]:
     """Make the trainings of a list and of the lists that it includes. `above` are the lists that include it.
 
-    Folders are relative to the list.
+    Folders in a list are relative to the folder of that list. `ask` holds the options that apply where the list has none.
     """
     file = Path(os.path.realpath(file))
     if file in above:

@@ -43,7 +43,7 @@ class Row(NamedTuple):
 
 
 def write_rows(file: Path, rows: list[Row]) -> None:
-    """Write the rows as JSON, in place of an earlier file. docs/batch.md describes it. A write that fails is ignored."""
+    """Write the rows to `file` as JSON (see docs/batch.md), in place of an earlier file. A write that fails is ignored."""
     facts = []
     for row in rows:
         figures = {key: row.figures[key] for key in SHOWN if key in row.figures}
@@ -83,7 +83,7 @@ def write_page(out: Path, rows: list[Row], seconds: float) -> None:
 
 
 def figures_of(run: Path) -> dict[str, float]:
-    """Read a run's metrics as a flat dict. Return {} if the file is missing or broken: the run's own report names the error."""
+    """Read a run's metrics as a flat dict. Return {} if the file is missing or damaged."""
     try:
         return dict(flatten(run_metrics(run)))
     except (OSError, ValueError, InputError):

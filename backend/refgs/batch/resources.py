@@ -1,4 +1,4 @@
-"""Estimate the memory that a training takes, so that as many run at once as fit."""
+"""Estimate the memory that a training takes. Ray then runs as many trainings at once as fit."""
 
 from refgs.settings import Settings
 
@@ -13,5 +13,5 @@ def memory(settings: Settings) -> int:
 
 
 def card_share(settings: Settings, card: int) -> float:
-    """Return the fraction of a card with `card` bytes of memory that a training takes, 0.01 … 1. Ray shares cards by such fractions."""
+    """Return the fraction, 0.01 … 1, of a GPU with `card` bytes of memory that a training takes. Ray divides GPUs by such fractions."""
     return round(min(max(memory(settings) / card, 0.01), 1.0), 2)

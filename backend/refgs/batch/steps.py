@@ -1,4 +1,4 @@
-"""Run a step of a batch, which is a command line of refgs, in a process of its own, and record how it ended.
+"""Run a step of a batch, one command such as `refgs train`, in a process of its own, and record how it ended.
 
 Ray's workers import this module. It imports little, so that they start soon.
 """
@@ -24,8 +24,8 @@ FAILED = (1, 2)  # exit statuses after which a retry is useless
 class Step(NamedTuple):
     """Describe a step: its `name`, such as "train", the `run` it belongs to, and the `words` of its command after `refgs`.
 
-    `log` is the file for the command's output. The step's record is beside it. `made` is a file that must exist once the step is done, or
-    None. `reads` and `writes` are the files and folders that the step uses; the folder of `log` is one of `writes`.
+    `log` is the file for the command's output. Beside it is a JSON file that records the outcome. `made` is a file that must exist once the
+    step is done, or None. `reads` and `writes` are the files and folders that the step uses; the folder of `log` is one of `writes`.
     """
 
     name: str
@@ -38,14 +38,14 @@ class Step(NamedTuple):
 
     @property
     def running(self) -> Path:
-        """Return the file that exists while the step runs."""
+        """Return the path of the file that exists only while the step runs."""
         return self.log.with_suffix(".running")
 
 
 class Outcome(NamedTuple):
     """Hold how a step ended: its exit status, its seconds, the machine, and one line if it failed.
 
-    The status is None if the step was not run, because one before it failed.
+    The status is None if the step was not run because an earlier step failed, or if the step was cancelled.
     """
 
     status: int | None
@@ -73,10 +73,10 @@ def recorded(step: Step) -> Outcome | None:
 
 
 def run_step(step: Step, cores: int, pause: float, depot: Any, optional: tuple[bool, ...], *before: Outcome) -> Outcome:
-    """Run a step and record its outcome beside its log. It is not run if an earlier step failed that must succeed.
+    """Run a step and record its outcome beside its log. Do not run it if an earlier step that must succeed has failed.
 
-    `cores` is the number of threads. `depot` copies files from and to the batch's machine; it is None if all steps run there. `before` are
-    the outcomes of the earlier steps that this one waits for. `optional` says for each of them whether it may fail.
+    `cores` is the number of threads. `depot` copies files from and to the machine on which `refgs batch` runs; it is None if all steps run
+    there. `before` are the outcomes of the earlier steps that this one waits for. `optional` says for each of them whether it may fail.
 
     Waits `pause` seconds and raises TryLater if the command was killed, if its exit status means that a retry may succeed, or if files
     cannot be copied or written.
@@ -123,8 +123,8 @@ def _run_and_record(step: Step, cores: int) -> Outcome:
 def _call(step: Step, cores: int, log) -> tuple[int, str]:
     """Run the command of a step. Return its exit status and its output.
 
-    The command ends when its input closes. This function closes the input if it is interrupted, and the system does if this process is
-    killed. So the command never runs on alone.
+    The command ends when its input closes. This function closes the input if it is interrupted, and the operating system closes it if this
+    process is killed. So the command does not outlive this process.
     """
     log.write(f"$ refgs {' '.join(step.words)}\n".encode())
     log.flush()
@@ -151,7 +151,10 @@ def _call(step: Step, cores: int, log) -> tuple[int, str]:
 
 
 def _line(printed: str, status: int) -> str:
-    """Return the line that says why a command failed: its last line that begins with "refgs: ", as the command line prints errors."""
+    """Return why a command failed, in one line: the signal that killed it, else the last error that it printed, else its exit status.
+
+    Errors are the lines that begin with "refgs: ".
+    """
     lines = [line.removeprefix("refgs: ") for line in printed.splitlines() if line.startswith("refgs: ")]
     if status < 0:
         return f"killed by signal {-status}"

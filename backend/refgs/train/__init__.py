@@ -1,1 +1,1 @@
-"""Train a capture into a run folder."""
+"""Train surfels, materials and light on a capture (photos with cameras), and write them into a run folder."""

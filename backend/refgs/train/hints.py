@@ -1,7 +1,7 @@
 """Continue a finished training with hints: parts of the surface that a user says are metal or paint.
 
-Photos of a mirror often have two explanations. A chrome egg at night mirrors darkness, and looks like black plastic. Training stays with
-the explanation that it found first, even if the other one is better, because pictures get worse on the way from one to the other.
+Photos of a mirror often have two explanations: a chrome egg at night mirrors darkness, and looks like black plastic. Training keeps the
+explanation that it finds first, even if the other one fits better, because pictures get worse on the way from one to the other.
 """
 
 from pathlib import Path
@@ -28,11 +28,11 @@ MIRROR = {"albedo": 0.8, "roughness": 0.1}
 
 
 def continue_with_hints(state: State, run: Path, hints: list[Hint]) -> None:
-    """Take over what a finished `run` has learned, return to an earlier iteration, and hold the metallic of the hinted parts.
+    """Load the last checkpoint of a finished `run`, go back to an earlier iteration, and keep the metallic of the hinted parts fixed.
 
-    Hinted metals start as a bright mirror, because the base colour that they had as plastic tells nothing. Hinted paint keeps its base
-    colour and roughness, because rough metal looks much like paint of its colour. The residual (see `State.residual_start`) is
-    reset for all surfels.
+    Hinted metals start as a bright mirror, because the base colour that they learned as plastic is of no use. Hinted paint keeps the base
+    colour and roughness that it learned as metal, because rough metal looks much like paint of its colour. The residual (see
+    `State.residual_start`) is reset for all surfels.
 
     Raises InputError if the run has no checkpoint, or if its settings leave out metals.
     """
@@ -53,7 +53,7 @@ def continue_with_hints(state: State, run: Path, hints: list[Hint]) -> None:
 
 
 def hinted_kinds(state: State, splats: np.ndarray, hints: list[Hint]) -> torch.Tensor:
-    """Return for each surfel (N,) the index in `KINDS` of the kind that a hint gives it, −1 without a hint.
+    """Return what the hints say of each surfel (N,): the index in `KINDS` of "metal" or "paint", or −1 without a hint.
 
     `splats` (M, 3) are the positions of the run's splats. Each point of a hint marks the nearest splat. If several hints mark a splat, the
     last one counts. Surfels take the kind of the nearest splat, because splats.ply has no rows for surfels that no photo shows.

@@ -1,4 +1,4 @@
-"""Give a part of a training its own memory, which checkpoints keep."""
+"""Define `Part`: the values that one task of a training remembers between iterations. Checkpoints store them."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -11,23 +11,23 @@ Fact = bool | int | Tensor
 
 
 class Part:
-    """Hold the memory of one task of a training, such as aligning poses. `state.part(Kind)` returns the part of the class `Kind`.
+    """Hold what one task of a training remembers, such as aligning poses. `state.part(Kind)` returns the object of the subclass `Kind`.
 
-    `train/timeline.py` says when each part acts. A checkpoint stores the part's `facts` under its `name`: numbers in the TOML file, and
-    tensors. By default, the facts are the attributes named in `saved` that are not None.
+    `train/timeline.py` says when each task is done. A checkpoint stores the object's `facts` under its `name`: numbers in the TOML file,
+    and tensors. By default, the facts are the attributes named in `saved` that are not None.
     """
 
     name: ClassVar[str]
     saved: ClassVar[tuple[str, ...]] = ()
 
     def start(self, state: State) -> None:
-        """Make the memory. Photos and surfels exist already."""
+        """Set the initial values. The state has its photos and surfels already."""
 
     def facts(self, state: State) -> dict[str, Fact]:
-        """Return the facts that a checkpoint keeps."""
+        """Return the values to store in a checkpoint, numbers and tensors by name."""
         return {name: value for name in self.saved if (value := getattr(self, name)) is not None}
 
     def restore(self, state: State, facts: Mapping[str, Any]) -> None:
-        """Restore the memory from the facts in a checkpoint."""
+        """Set the values to those from a checkpoint (see `facts`)."""
         for name in self.saved:
             setattr(self, name, facts.get(name))

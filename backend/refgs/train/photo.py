@@ -1,4 +1,4 @@
-"""Hold a photo as the training uses it, on its device, and find the part of it that shows the object."""
+"""Hold a photo on the training's device, and find the crop of it that shows the object."""
 
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ class Photo(NamedTuple):
 
     - `image` (H, W, 3): integer codes of sRGB values, uint8 or uint16. The code `white` stands for the value 1. The dtype's largest code
       stands for its own value and for all brighter ones.
-    - `mask` (H, W): uint8, or None.
+    - `mask` (H, W): how much of each pixel the object covers, as uint8 from 0 to 255. None if the photo has no mask.
     - `whole` (H, W): the size of the whole photo if this is a crop. Beyond the crop, the whole photo is background.
     """
 
@@ -36,7 +36,7 @@ class Photo(NamedTuple):
         return cls(torch.from_numpy(view.image).to(device), mask, view.camera, white=view.white)
 
     def part(self, rows: slice, columns: slice) -> "Photo":
-        """Return this photo cropped to ranges of rows and columns."""
+        """Return this photo and its camera, cropped to ranges of rows and columns."""
         image = self.image[rows, columns].contiguous()
         mask = None if self.mask is None else self.mask[rows, columns].contiguous()
         camera = self.camera.cropped(columns.start, rows.start, image.shape[1], image.shape[0])
@@ -57,12 +57,12 @@ class Photo(NamedTuple):
 
     @property
     def clipped(self) -> Tensor:
-        """Tell which channels of the pixels are clipped, bool (H, W, 3). JPEG changes codes a little, so nearly clipped ones count, too."""
+        """Tell which channels of the pixels are clipped, bool (H, W, 3). Codes just below the largest count, too: JPEG changes codes."""
         return self.image.float() >= torch.iinfo(self.image.dtype).max // 255 * 254
 
 
 def crop_of(view: LoadedView, margin: int) -> Crop:
-    """Return the part of a view's photo that shows the object: the bounds of its mask, or the whole photo if it has none."""
+    """Return the crop that shows the object: the bounds of the photo's mask plus `margin` pixels, or the whole photo without a mask."""
     height, width = view.image.shape[:2]
     return (slice(0, height), slice(0, width)) if view.alpha is None else bounds(view.alpha, margin)
 

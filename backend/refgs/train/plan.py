@@ -12,7 +12,7 @@ MIRRORED = 1.2  # factor on the time for inter-reflection: 1 without, 1.4 if muc
 
 
 class Stage(NamedTuple):
-    """Describe a stage of a training: it lasts up to the progress `until`, on photos reduced by `factor` (see `learn/coarse.py`)."""
+    """Describe a stage of a training. Until the progress `until` (0..1), the photos' sides are divided by `factor` (`learn/coarse.py`)."""
 
     until: float
     factor: int
@@ -29,9 +29,9 @@ FULL = (Stage(1.0, 1),)
 def iterations_time(growth: float, progress: float, stages: tuple[Stage, ...] = FULL) -> float:
     """Compute how long all iterations up to a progress of 0..1 take together.
 
-    Iterations slow down: the last takes `growth` times as long as the first, if both are on full photos. If all were as fast as the first
-    on full photos, the whole training would take 1 unit of time. The result is in this unit. At a progress of 1, it is at most `growth`,
-    and at least 1 if photos are not reduced.
+    The unit is the time that the whole training would take if each iteration were as fast as the first one on full photos. But iterations
+    slow down: the last takes `growth` times as long as the first, if both are on full photos. At a progress of 1, the result is at most
+    `growth`, and at least 1 if photos are not reduced.
     """
     first, last = GROWS
 

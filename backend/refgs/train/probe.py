@@ -33,7 +33,7 @@ Change = Callable[[RenderInputs], RenderInputs]
 
 
 def without_specular(inputs: RenderInputs) -> RenderInputs:
-    """Return inputs for rendering all surfaces as matte."""
+    """Return a copy of `inputs` with which all surfaces are rendered as matte."""
     return inputs._replace(settings=inputs.settings.model_copy(update={"reflection": "none"}), occluder=None)
 
 
@@ -43,10 +43,10 @@ def picture(state: State, view: int, inputs: RenderInputs, whole: bool = False) 
 
 
 class Lost(NamedTuple):
-    """Hold how many dB of PSNR the training views lose by a change of what is rendered.
+    """Hold how many dB of PSNR the training views lose by a change of what is rendered, such as leaving out reflections.
 
-    `whole` is the loss over all of the object's pixels. `part` is the loss over the fraction PART of these pixels that changes most: a
-    small part of the object may need something that the rest does not.
+    `whole` is the loss over all of the object's pixels. `part` is the loss over the fraction PART of these pixels that changes most,
+    because a small part of the object may need a feature that most of it does not.
     """
 
     whole: float
@@ -61,9 +61,9 @@ def decibels_lost(errors: Tensor, without: Tensor) -> float:
 def lost(views: Iterable[tuple[Tensor, Tensor, Tensor]]) -> Lost:
     """Compute how many dB of PSNR are lost from the first to the second of two pictures of each view.
 
-    Each of `views` is (picture, changed picture, photo), all encoded pixels (P, 3) of the object. The pixels of `Lost.part` are those in
-    which the two pictures differ most. This does not depend on the photo, so that chance favours neither picture. `views` may be a
-    generator: only three numbers per pixel are kept.
+    Each of `views` is (picture, changed picture, photo): the object's sRGB-encoded pixels in them, (P, 3) each. The pixels of `Lost.part`
+    are those in which the two pictures differ most. The photo is not used to choose them, so that its noise favours neither picture.
+    `views` may be a generator: only three numbers per pixel are kept.
     """
     rows = []
     for picture, other, truth in views:
@@ -75,7 +75,7 @@ def lost(views: Iterable[tuple[Tensor, Tensor, Tensor]]) -> Lost:
 
 
 def spread_views(state: State, most: int = VIEWS) -> list[int]:
-    """Choose at most `most` training views, evenly spaced in the order of the photos."""
+    """Return the indices of at most `most` training views, evenly spaced in the order of the photos."""
     return [*spread(range(len(state.photos)), most)]
 
 
@@ -111,7 +111,7 @@ def psnr_loss(state: State, change: Change, inputs: RenderInputs | None = None) 
 def _on_object(
     state: State, inputs: RenderInputs, views: list[int], pairs: Iterable[Sequence[Tensor]]
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Cut the object's pixels (P, 3) out of pairs of pictures of the `views`. Yields (one, other, photo)."""
+    """Yield for each of the `views` the object's pixels (P, 3) in both pictures of its pair, and in the photo."""
     for view, (one, other) in zip(views, pairs, strict=True):
         shown = on_object(state, inputs.surfels, view)
         yield one[shown], other[shown], state.photo(view).over(state.background)[shown]
@@ -121,9 +121,9 @@ def _on_object(
 def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: bool = False) -> float:
     """Measure how many seconds a change of what is rendered would save in all remaining iterations.
 
-    Time two iterations: one without the change, and one with it. The optimiser's step is not timed. Both render only the crop of the photo
-    that the training uses. If `whole` is true, the first one renders the whole photo, so that the result includes what cropping saves.
-    Both use photos of full size. Remaining iterations on reduced photos are counted as shorter.
+    Time two iterations on photos of full size: one without the change, and one with it. The optimiser's step is not timed. Both render only
+    the crop of the photo that the training uses. But if `whole` is true, the iteration without the change renders the whole photo, so that
+    the result includes what cropping saves. Remaining iterations on reduced photos are counted as shorter.
     """
     fastest = [math.inf, math.inf]
     for _ in range(REPEATS):
@@ -140,10 +140,10 @@ def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: b
 
 
 def mirrored_and_mean(state: State, inputs: RenderInputs, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render `views` twice, encoded (H, W, 3): with reflections, and with reflections that do not change with the view.
+    """Yield two sRGB-encoded pictures (H, W, 3) of each view: with reflections, and with reflections that do not change with the view.
 
     In the second picture, each surfel's specular colour is its mean over the `views`, which a matte surface could learn as albedo. Call
-    this without gradients.
+    this function under `torch.no_grad()`.
     """
     dull = without_specular(inputs)
     over = (picture(state, view, inputs).radiance - picture(state, view, dull).radiance for view in views)
@@ -161,7 +161,7 @@ def mirrored_and_mean(state: State, inputs: RenderInputs, views: list[int]) -> I
 def specular_explains(state: State) -> Lost:
     """Compute how many dB of PSNR the training views lose if reflections no longer change with the view.
 
-    Only specular shading can explain this loss (see `mirrored_and_mean`).
+    Matte shading cannot make up for this loss, because each surfel's mean reflection is kept (see `mirrored_and_mean`).
     """
     inputs, some = state.inputs(), spread_views(state, SEVERAL)
     return lost(_on_object(state, inputs, some, mirrored_and_mean(state, inputs, some)))
@@ -185,7 +185,7 @@ def mirroring_itself(inputs: RenderInputs, radiance: Tensor) -> RenderInputs:
 def reflections_explain(state: State) -> Lost:
     """Estimate how many dB of PSNR the training views can gain from inter-reflection at most.
 
-    Two pictures are compared. Where the object mirrors itself, one picture shows black there, and the other shows the environment's light.
+    Two pictures are compared. Where the object mirrors itself, one picture shows black, and the other shows the environment's light.
     The correct picture lies between the two, so the gain is at most their difference. The result is how many dB the PSNR falls if this
     difference is added to the error against the photos.
     """

@@ -1,4 +1,4 @@
-"""Set up a training: load the photos, choose the light's frame, and make the surfels and the optimiser.
+"""Set up a training: load the photos, decide whether the light turns with the camera, and make the surfels and the optimiser.
 
 Also start the second stage of a training, in which pixels are shaded instead of surfels.
 """
@@ -63,7 +63,7 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
 
 
 def _choose_light_frame(state: State, start: Parameters, on_hull: int) -> None:
-    """Choose from the photos whether the light stands still in the world or turns with the camera. Do so only if the setting is "auto".
+    """If `light.frame` is "auto", decide from the photos whether the light stands still in the world or turns with the camera.
 
     `start` are the surfels' initial parameters. The first `on_hull` of these surfels lie on the visual hull.
     """

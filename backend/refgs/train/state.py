@@ -28,7 +28,7 @@ P = TypeVar("P")
 
 
 def spread(items: Sequence, most: int) -> Sequence:
-    """Choose at most `most` items, evenly spaced."""
+    """Return every n-th item, from the first one on, but at most `most` items. n is len(items) // most, and at least 1."""
     return items[:: max(1, len(items) // most)][:most]
 
 
@@ -114,8 +114,8 @@ class State:
     def residual_start(self) -> float:
         """Return the progress (0..1) from which on the residual learns, or 1 if it never learns.
 
-        The residual is a colour that changes with the direction. It is added to the shaded colour, and learns those parts of the photos
-        that material and light do not explain.
+        The residual is a colour that changes with the viewing direction. It is added to the shaded colour, and learns what material and
+        light do not explain in the photos.
         """
         settings = self.settings
         return settings.residual.start if self.method.deferred and settings.render.diffuse == "irradiance" else 1.0
@@ -150,7 +150,7 @@ class State:
         return RenderInputs(self.surfels(), self.environment(), settings, self.occluder)
 
     def picture(self, inputs: RenderInputs, camera: Camera, exposure: Tensor | None = None) -> Rendering:
-        """Render the picture of a camera from these inputs, with gradients."""
+        """Render a camera's picture from `inputs`, with gradients. `exposure` (3,) are factors for its linear red, green and blue."""
         surfels, environment, settings, occluder = inputs
         return render(surfels, environment, camera, self.background, settings, self.near, occluder, exposure)
 
@@ -161,7 +161,7 @@ class State:
         return self.picture(inputs if surfels is None else inputs._replace(surfels=surfels), camera)
 
     def photo(self, view: int, whole: bool = False) -> Photo:
-        """Return a view's photo as loaded. It is cropped to the pixels that the training uses, unless `whole` is true."""
+        """Return a training view's photo in the size in which it was loaded. If `whole` is false, it is cropped to the pixels in use."""
         photo = self.photos[view]
         return photo if whole or self.crops is None else photo.part(*self.crops[view])
 

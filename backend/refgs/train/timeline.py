@@ -1,4 +1,4 @@
-"""Tell when each action of a training is done. Each action has one row.
+"""Tell when each action of a training is done. Each action has one `Row`.
 
 `Trainer.step` does what is due in BEFORE, renders a photo and takes a step of Adam, and then does what is due in AFTER.
 `scripts/timeline_page.py` prints all rows into docs/timeline.md. No other module of the training compares its progress with a threshold.
@@ -32,9 +32,9 @@ FIRST_LINE, A_DECADE = 10, 10  # first iteration with a line in the history, and
 class Step:
     """Hold the facts of the iteration that is being done.
 
-    `progress` is that of the training when the iteration begins. `done` counts finished iterations, and includes this one from Adam's step
-    on. `view` is the training view. `hidden` is None unless this iteration has made a mesh. Then it is the fraction of the object's pixels
-    that mirror the object. `photo` and `rendering` are set from Adam's step on.
+    `progress` is the training's progress (0..1) when the iteration begins. `done` counts finished iterations, and includes this one from
+    Adam's step on. `view` is the index of the training view. `hidden` is None unless this iteration has made a mesh. Then it is the
+    fraction of the object's pixels that mirror the object. `photo` and `rendering` are set from Adam's step on.
     """
 
     photo: Photo
@@ -79,7 +79,7 @@ ONCE = Every("once", lambda state: 1)
 class Row(NamedTuple):
     """Tell when one action is done: from `start` on and before `until`, in iterations that are multiples of `every`, if `only_if` holds.
 
-    `clock` names the part of the training's time (`refgs.clock`) that includes the action; None if it measures its own.
+    `clock` is the part of the training's clock (`refgs.clock`) to which the action's time is added. If it is None, `walk` does not time it.
     """
 
     what: str
@@ -106,7 +106,7 @@ def part(of: float) -> When:
 
 
 def part_after_initial(of: float) -> When:
-    """Return the time when the fraction `of` of the training has passed since the end of the initial stage."""
+    """Return the time when the fraction `of` of the training has passed since the end of the initial stage (see `start_deferred`)."""
     return When(f"`initial.until` + {of:.0%}", lambda state, step: step.progress - state.settings.initial.until >= of)
 
 
@@ -135,14 +135,15 @@ def iterations(count: int) -> Every:
 def decidable(state: State, done: int) -> bool:
     """Tell whether surfels, materials and light can be judged after `done` iterations.
 
-    They cannot in the initial stage, while surfels are faint after an opacity reset, or if the method does not shade pixels by materials.
+    They cannot if the method does not shade pixels by materials, in the initial stage (see `start_deferred`), or while surfels are faint
+    after an opacity reset.
     """
     by_pixels = state.method.deferred and state.settings.render.diffuse == "irradiance"
     return by_pixels and not state.initial and not faint_now(state, done)
 
 
 def metals_decidable(state: State, done: int) -> bool:
-    """Tell whether photos can decide now what is metal. They cannot without specular shading, or if the schedule propagates normals."""
+    """Tell whether photos can show what is metal: `decidable` must hold, `reflection` be "microfacet", and normals not be propagated."""
     settings = state.settings
     return settings.render.reflection == "microfacet" and not settings.propagation.every and decidable(state, done)
 
@@ -150,7 +151,7 @@ def metals_decidable(state: State, done: int) -> bool:
 def since_propagation(state: State, done: int) -> int | None:
     """Count the iterations since normals were last propagated (see `propagate_normals`).
 
-    Returns None before the first propagation, and once the training no longer propagates normals.
+    Returns None if normals have not been propagated yet, or are no longer propagated.
     """
     settings = state.settings.propagation
     if not settings.every or done < settings.every or not state.method.lit:
@@ -214,7 +215,7 @@ def _resets(state: State, step: Step) -> bool:
 
 
 def _first_plan(state: State, step: Step) -> bool:
-    """Tell whether to plan the iterations now: 10 iterations after `Plan.begin`, when their pace is known, then at every 50th iteration."""
+    """Tell whether to plan the iterations now: 10 iterations after `Plan.begin`, when the pace is known, and at multiples of 50."""
     since = step.done - state.plan.first
     return since == 10 or (since > 0 and step.done % 50 == 0)
 

@@ -1,4 +1,4 @@
-"""Train surfels, one view per iteration. Some iterations also change the light's resolution, trace a mesh, or divide surfels."""
+"""Train surfels, one view per iteration. Some iterations also change the light's resolution, make a mesh, or divide surfels."""
 
 import time
 from collections.abc import Callable
@@ -101,7 +101,7 @@ class Trainer:
         return figures
 
     def _learn(self, step: Step) -> dict[str, Tensor]:
-        """Render the photo, and take a step of Adam towards it. Returns the `loss` and the mean squared error, `square`."""
+        """Render the view, compare it with its photo, and take a step of Adam. Returns `loss` and the mean squared error, `square`."""
         state = self.state
         inputs, step.photo = state.inputs(), coarse.photo(state, step.view, WHOLE.due(state, step))
         step.rendering = state.picture(inputs, step.photo.camera, exposures.exposure(state, step.view))
@@ -120,9 +120,9 @@ class Trainer:
         return {"loss": loss.detach(), "square": square}
 
     def _next_view(self) -> int:
-        """Choose the next view. Each epoch takes every view once, in a random order.
+        """Return the index of the next training view. Each epoch uses every view once, in a random order.
 
-        The order depends only on the seed and the epoch, so that a resumed run takes the same one.
+        The order depends only on the seed and the epoch, so that a resumed run has the same order.
         """
         epoch, place = divmod(self.state.iteration, len(self.state.views))
         if self._order[0] != epoch:
@@ -131,10 +131,7 @@ class Trainer:
         return self._order[1][place]
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> bool:
-        """Train to the end, or until `stop` returns true. Returns whether the end was reached.
-
-        A checkpoint is written in both cases.
-        """
+        """Train to the end, or until `stop` returns true, and write a checkpoint. Returns whether the end was reached."""
         state, means = self.state, self.state.part(Means)
         before, first = state.seconds, state.iteration
         more = growth(state.learned.count, state.settings.surfels.budget)
@@ -209,8 +206,8 @@ class Trainer:
     def _check(self, whole: bool) -> None:
         """Let `Guard.look` look for values that are not finite. If it returns a reason, go back to the last checkpoint, and warn.
 
-        The time spent since that checkpoint still counts as training time. If `whole` is true, surfels are checked even if no step was
-        skipped.
+        The time spent since that checkpoint still counts as training time. If `whole` is true, all surfels are checked. Otherwise they are
+        checked only if a step was skipped, because its loss or gradients were not finite.
         """
         state = self.state
         if why := self.guard.look(state, whole, lambda: checkpoint.complete(state.folder / CHECKPOINTS)):
@@ -226,7 +223,7 @@ class Trainer:
         del self.measures
 
     def resume(self) -> None:
-        """Resume from the last complete checkpoint that is not damaged. Start over, from the first iteration, if there is none."""
+        """Resume from the last complete, undamaged checkpoint. Without one, raise NoCheckpoint, but at iteration 0 do nothing."""
         try:
             snapshot.restore(self.state, self.state.folder)
         except checkpoint.NoCheckpoint:

@@ -1,1 +1,1 @@
-"""Keep what a training has learned: checkpoints, its history, and the asset at its end."""
+"""Save a training: checkpoints, previews, the history of its errors, and at its end the asset (surfels, light and mesh)."""

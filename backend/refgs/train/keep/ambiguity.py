@@ -1,4 +1,4 @@
-"""Measure ambiguities: changes of light and materials that cancel in all pictures, so that photos cannot tell them apart."""
+"""Measure ambiguities: pairs of changes to light or materials that cancel in all pictures, so that photos cannot rule them out."""
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -30,9 +30,9 @@ def _redder(old: Explanation, size: float) -> Explanation:
 
 
 def _blurred(old: Explanation, size: float) -> Explanation:
-    """Blur the environment's light: blend each texel with the mean of its neighbours, which gets the weight `size`.
+    """Return `old` with a blurred environment: each texel is blended with the mean of the texels around it, which has the weight `size`.
 
-    Neighbours lie on the same face of the cubemap, at most a sixteenth of the face's side away.
+    The mean is over a square on the same cubemap face. It reaches a sixteenth of the face's side in each direction, but at least one texel.
     """
     side = round((len(old[1]) // 6) ** 0.5)
     faces = old[1].view(6, side, side, 3).permute(0, 3, 1, 2)
@@ -62,8 +62,8 @@ def _more_metal(old: Explanation, size: float) -> Explanation:
 class Trade(NamedTuple):
     """Hold two changes of the scene that may cancel in the pictures, such as a brighter light and a darker base colour.
 
-    `change` makes the first change, with the strength `size`. `made_up` makes the second change. Two texts describe them to the user:
-    `words` the first change, and `answer` what the second one changes.
+    The function `change` makes the first change, with the strength `size`. The function `made_up` makes the second one, with any strength.
+    Two texts are for the user: `words` describes the first change, and `answer` names what the second one alters.
     """
 
     words: str
@@ -84,7 +84,7 @@ TRADES = {
 def ambiguities(state: State) -> dict[str, dict]:
     """Measure how well the two changes of each pair in `TRADES` cancel in the pictures of a finished training.
 
-    Returns a dictionary of values for each pair, by the pair's name. If the scene has no light, nothing is measured. The values are:
+    Returns a dictionary of values for each pair, by the pair's name; {} if the scene has no light. The values are:
 
     - `alone`: how much the first change alters the pictures.
     - `answer`: the strength of the second change that cancels the first one best.
@@ -92,8 +92,8 @@ def ambiguities(state: State) -> dict[str, dict]:
     - `error`: how much the pictures differ from the photos.
     - `what`: a message for the user. It is present only if `left` is less than UNSEEN times `error`.
 
-    `alone`, `left` and `error` are root mean squares of differences of encoded colours. To measure how a change alters the pictures, the
-    change is made with the fraction SMALL of its strength. The difference is then divided by SMALL.
+    `alone`, `left` and `error` are root mean squares of differences of sRGB-encoded colours. To measure how a change alters the pictures,
+    only the fraction SMALL of it is made, and the difference is divided by SMALL.
     """
     light = state.environment()
     if light is None:
@@ -124,7 +124,7 @@ def ambiguities(state: State) -> dict[str, dict]:
 
 
 def _pictures(state: State, scene: Explanation, chosen: range) -> Iterator[Tensor]:
-    """Render `scene` in the training views with the indices `chosen`. Yield pictures (H, W, 3)."""
+    """Render `scene` in the training views with the indices `chosen`. Yield sRGB-encoded pictures (H, W, 3) in 0..1."""
     light = Environment(scene[1].contiguous(), state.inputs().light.reference)
     inputs = RenderInputs(scene[0], light, state.settings.render, state.occluder)
     for view in chosen:

@@ -34,13 +34,13 @@ from refgs.train.state import State, why_not_traced
 def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) -> None:
     """Write the results of a training into its run folder.
 
-    These are the surfels (splats.ply), the light (environment.exr), and what the training left out (needs.json). With inter-reflection, the
-    object's mesh is written to occluder.ply. With learned exposures or poses, cameras.json is written again to include them. If the
-    training decides from the photos what is metal, splats.ply also has each surfel's doubt, and metrics.json has the fraction of the
-    surface that is in doubt.
+    These are the surfels (splats.ply), the light (environment.exr), and the optional features that the training left out or kept
+    (needs.json). If inter-reflection was traced, the object's mesh is written to occluder.ply. If exposures or poses were learned,
+    cameras.json is written again to include them. If the training decides from the photos what is metal, splats.ply also has each surfel's
+    doubt (0..1: how little photos tell metal from paint), and metrics.json the fraction of the surface with a doubt of at least 0.5.
 
-    A run that has splats.ply counts as finished. So this file is written last, after `before_splats` is called. Raises InputError if the
-    photos show nothing in the region.
+    splats.ply is written last, because a run that has it counts as finished. `before_splats` is called just before. Raises InputError if
+    the photos show no surfel in the region to train.
     """
     with torch.no_grad():
         surfels = with_normals_last(state.surfels())
@@ -73,7 +73,7 @@ def _without_unlearned(surfels: Surfels, state: State) -> Surfels:
 
 
 def _without_untraced(surfels: Surfels, state: State) -> Surfels:
-    """Drop the surfels' values of inter-reflection if the training has made no mesh to trace it on."""
+    """If the training made no mesh to trace rays on, drop the surfels' inter-reflected light and set `received` to 1 (unoccluded)."""
     if state.occluder is not None:
         return surfels
     nothing, whole = surfels.indirect_dc[:, :0], torch.ones_like(surfels.received)
@@ -82,7 +82,7 @@ def _without_untraced(surfels: Surfels, state: State) -> Surfels:
 
 @torch.no_grad()
 def _with_relightable_albedo(surfels: Surfels, state: State) -> Surfels:
-    """Return surfels that have both an albedo and SH colours, if the scene has a light.
+    """If the scene has a light, give the surfels both an albedo and SH colours.
 
     Programs that light the surfels use the albedo. Programs that display the surfels without lighting use the SH colours.
 
@@ -107,9 +107,10 @@ REWRITES = (_without_unlearned, _without_untraced, _with_relightable_albedo)
 
 
 def _with_constants(surfels: Surfels, state: State, kept: Tensor) -> tuple[Surfels, dict[str, float]]:
-    """Give all surfels the same metallic, roughness or specular, if theirs are nearly equal. Return the surfels, and the values by name.
+    """Give all surfels the same metallic or roughness if theirs are nearly equal. Return the surfels, and these values by name.
 
-    splats.ply then needs no column for these values. Only surfels whose entry in `kept` (N,) is true are compared.
+    splats.ply then needs no column for them. Only surfels whose entry in `kept` (N,) is true are compared. Without specular shading, all
+    surfels get metallic 0 and roughness 1, and the values include specular 0.
     """
     if state.settings.render.reflection == "none" and state.method.lit:
         constants = {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
@@ -179,7 +180,7 @@ def _seen_side(surfels: Surfels, state: State) -> Tensor:
 
 
 def _needs_rows(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) -> list[dict[str, Any]]:
-    """Make the rows of needs.json. Each tells what the training left out, or decided to keep, and why, and what leaving it out saved.
+    """Return the rows of needs.json. Each names a feature that the training left out or kept, the reason, and what leaving it out saved.
 
     `side` (N,) is the result of `_seen_side`. `wanted` (N,) is true for surfels in the region to train.
     """

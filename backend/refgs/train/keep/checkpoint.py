@@ -25,11 +25,11 @@ DAMAGED = ".damaged"  # added to the names of a checkpoint's files that cannot b
 
 
 class NoCheckpoint(InputError):
-    """Error for a folder without a complete checkpoint. A training that was killed before its first one can start over."""
+    """Error for a folder without a complete checkpoint. A training that was killed before its first checkpoint can start over."""
 
 
 def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
-    """Write the tensors of an iteration to a safetensors file, and its other values, `facts`, to a TOML file.
+    """Write the checkpoint of an iteration: its tensors to a safetensors file, and its other values, `facts`, to a TOML file.
 
     The checkpoint is complete once its TOML file is there. Older checkpoints than the last two are removed. Raises TryAgain when the disk
     is full; earlier checkpoints then stay complete.
@@ -98,12 +98,12 @@ def _begun(folder: Path) -> list[int]:
 
 
 def _files(folder: Path, iteration: int) -> tuple[Path, Path]:
-    """Return the files of a checkpoint in the order in which they are written."""
+    """Return the paths of a checkpoint's safetensors file and TOML file, in the order in which they are written."""
     return folder / f"{iteration:08d}.safetensors", folder / f"{iteration:08d}.toml"
 
 
 def _read(folder: Path, iteration: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read a checkpoint. Raises one of many errors if it is damaged."""
+    """Read the tensors of a checkpoint, and the values in its TOML file. Raises any of the errors that `load` catches if it is damaged."""
     data, note = _files(folder, iteration)
     whole_text = read_text(note, "").replace("\r\n", "\n")  # with the line ends that were hashed
     head, _, text = whole_text.partition("\n")
@@ -118,7 +118,7 @@ def _read(folder: Path, iteration: int) -> tuple[dict[str, Tensor], dict[str, An
 
 
 def _hash(data: Path, text: str) -> str:
-    """Hash the contents of a checkpoint's two files, except the first line of the TOML file, which holds the hash."""
+    """Hash a checkpoint's tensor file `data`, and the `text` of its TOML file after the first line, which holds the hash."""
     found = hash_file(data)
     found.update(text.encode())
     return found.hexdigest()

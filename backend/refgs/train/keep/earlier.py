@@ -1,4 +1,4 @@
-"""Read checkpoints of earlier releases as if today's had written them."""
+"""Convert checkpoints of the earlier release 0.1.0 to the form that this release writes."""
 
 from typing import Any
 
@@ -17,9 +17,9 @@ RENAMED = {
 
 
 def as_of_today(tensors: dict[str, Tensor], facts: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Convert the tensors and facts of a checkpoint of release 0.1.0 to today's form. Return those of later releases unchanged.
+    """Convert the tensors and facts of a checkpoint of release 0.1.0 to the present form. Return those of later releases unchanged.
 
-    0.1.0 marked surfels whose metallic must not learn by special values of it (HELD), and stored all parts' facts in one flat table.
+    0.1.0 had no mask `held`: a metallic with a value in HELD was not learned. It stored the facts of all parts (see `Part`) in one table.
     """
     if "residual" in facts:
         return tensors, facts

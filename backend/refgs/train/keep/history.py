@@ -34,9 +34,9 @@ def allowed(iteration: int, total: int, seconds: float) -> float:
 
 
 def record(state: State, measures: Measures) -> None:
-    """Add a line to the history that describes the training now.
+    """Add a line about the training's present state to the history, and report it as the event "measured".
 
-    Errors against held-out photos and ground truth are measured if there is time for it (see `allowed`).
+    Errors against held-out photos and ground truth are measured if there is time for it (see `allowed`), and at the training's end.
     """
     means = state.part(Means)
     limit = math.inf if state.ended else allowed(state.iteration, state.total, state.seconds)
@@ -57,7 +57,7 @@ def record(state: State, measures: Measures) -> None:
 def trim(folder: Path, iteration: int, report: Report) -> None:
     """Remove from the history the lines of iterations after `iteration`, because the training will do these iterations again.
 
-    Damaged lines are removed, too, and reported. If the history cannot be read at all, it is set aside, and that is reported.
+    Damaged lines are removed, too, and reported. If the file cannot be read at all, it is renamed (see `set_aside`), and that is reported.
     """
     file = folder / FILE
     try:

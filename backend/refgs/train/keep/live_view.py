@@ -13,9 +13,10 @@ PREVIEW = "preview"  # in the run folder
 
 
 def write_preview(state: State) -> dict[str, str | int]:
-    """Write a preview: RUN/preview/view.png, a view rendered now, and RUN/preview/splats.ply, the surfels now.
+    """Write the present surfels to RUN/preview/splats.ply, and a picture of them to RUN/preview/view.png.
 
-    Each file is written whole or not at all. Returns the two paths and the iteration.
+    The picture is of the first held-out view, or of the first training view if there is none. Surfels outside the region to train are left
+    out. Each file is written whole or not at all. Returns the paths, `splats` and `view`, and the `iteration`.
     """
     folder = state.folder / PREVIEW
     view = (state.test or state.views)[0]

@@ -34,7 +34,8 @@ def held_out_psnr(state: State, most: int = MEASURED_VIEWS) -> float | None:
 class _TestView(NamedTuple):
     """Hold a held-out view and its ground truth.
 
-    `known` are true maps by name, such as normals. `alpha` is the object's true coverage. `relit` is a true picture under another light.
+    `known` holds true maps by name, such as normals. `alpha` (H, W) is the object's true coverage, 0..1. `relit` is a true picture under
+    another light, in linear RGBA (H, W, 4), or None.
     """
 
     view: LoadedView
@@ -46,8 +47,8 @@ class _TestView(NamedTuple):
 class Measures:
     """Measure a few fixed held-out views against their photos and their ground truth.
 
-    Ground truth is the capture's folder `ground_truth` (see `compare.truth.GroundTruth`), or that of the capture's data set. If its
-    pictures differ in size from the photos, a warning is reported and ground truth is not used.
+    Ground truth is the capture's folder `ground_truth` (see `compare.truth.GroundTruth`), or the files of a published data set (see
+    `published_truth`). If it cannot be read, or differs in size from the photos, a warning is reported and it is not used.
     """
 
     def __init__(self, state: State) -> None:
@@ -83,7 +84,7 @@ class Measures:
         return _TestView(loaded, known, alpha, relit)
 
     def _read_lights(self, truth: GroundTruth, device: torch.device) -> None:
-        """Read two lights from the ground truth: the light of the photos, and another light under which the capture has true pictures."""
+        """Read two lights from the ground truth, if it has them: that of the photos, and another one under which it has true pictures."""
         if not self._method.lit:
             return
         # Else the training's light turns with the camera, and the true one does not.
@@ -97,9 +98,9 @@ class Measures:
         """Measure the errors of the training now, averaged over the held-out views. Returns them by name.
 
         `psnr_test` is measured against the held-out photos. The others need ground truth: `normal_mae_degrees`, `albedo_psnr`,
-        `metallic_mae`, `metallic_wrong`, `roughness_mae`, `light_log_rmse` (natural logarithm) and `relit_psnr` (without
-        inter-reflection). Some values are first scaled to fit the truth best: each channel of the linear albedo by its own factor, and
-        the light and the relit pictures each by one factor for all channels.
+        `metallic_mae`, `metallic_wrong` (fraction of pixels off by more than 0.5), `roughness_mae`, `light_log_rmse` (natural logarithm)
+        and `relit_psnr` (without inter-reflection). Some values are first scaled to fit the truth best: each channel of the linear albedo
+        by its own factor, and the light and the relit pictures each by one factor for all channels.
         """
         rows: dict[str, list] = {}
         for test in self._test_views:

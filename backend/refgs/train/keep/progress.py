@@ -1,4 +1,4 @@
-"""Average the loss over the last iterations, for the history and the progress that is reported."""
+"""Average the loss over the last iterations, for the history and for the progress events."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -45,6 +45,6 @@ class Means(Part):
 
 
 def running(mean: Tensor, figure: Tensor) -> Tensor:
-    """Return the running mean after a new value, `figure`. If the value is not finite, return the mean unchanged."""
+    """Return the exponential running mean after a new value, `figure`, with the weight 0.05. If `figure` is not finite, return `mean`."""
     known = torch.where(mean.isfinite(), figure + 0.95 * (mean - figure), figure)
     return torch.where(figure.isfinite(), known, mean)

@@ -32,9 +32,9 @@ def save(state: State) -> None:
 
 
 def restore(state: State, run: Path) -> None:
-    """Take over the last checkpoint of a run that is complete and not damaged.
+    """Restore `state` from the last checkpoint in the run folder `run` that is complete and not damaged.
 
-    Raises `checkpoint.NoCheckpoint` if there is none, and InputError if another release of RefGS wrote it.
+    Raises `checkpoint.NoCheckpoint` if there is none, and InputError if this release of RefGS cannot use it.
     """
     tensors, tables = as_of_today(*checkpoint.load(run / "checkpoints", state.report))
     facts = validated(tables, Facts, str(run / "checkpoints"), "Train again into a new folder.")
