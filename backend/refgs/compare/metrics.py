@@ -218,11 +218,12 @@ def _elevations(height: int) -> np.ndarray:
 def environment_log_rmse(environment: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
     """Compute the RMS error of a recovered panorama's log radiance, after a correction of its brightness.
 
-    The correction is one factor. It is chosen such that the mean difference of the logarithms is zero. Returns the error and the factor.
+    The correction is one factor on the recovered panorama, `environment`. It is chosen such that the mean difference of the logarithms is
+    zero. Returns the error and the factor.
 
     Both panoramas are equirectangular (h, w, 3) and linear. The larger one is averaged down to the size of the smaller one. Pixels are
-    weighted by solid angle. The logarithm is natural: an error of 0.1 is about 10 %. A thousandth of a panorama's mean radiance is added to
-    it before the logarithm. So differences between almost black pixels hardly count.
+    weighted by solid angle. The logarithm is natural: an error of 0.1 is about 10 %. Before the logarithm, a thousandth of a panorama's
+    mean radiance is added to its pixels. So differences between almost black pixels hardly count.
     """
     a, b = (resized(x, min(len(environment), len(reference))) for x in (environment, reference))
     weight = np.cos(_elevations(len(a)))

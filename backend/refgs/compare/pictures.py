@@ -16,7 +16,7 @@ TOLD, DOUBTFUL = (0.33, 0.35, 0.38), (1.0, 0.6, 0.15)  # sRGB: where photos tell
 
 
 def composite(view: LoadedView, background: Tensor) -> Tensor:
-    """Composite a photo over a background colour (3,). Return sRGB-encoded floats (H, W, 3) in 0..1.
+    """Composite a photo over a background colour (3,), both sRGB-encoded. Return floats (H, W, 3) in 0..1.
 
     Values brighter than white are clipped. A photo without alpha is only clipped.
     """
@@ -51,13 +51,16 @@ def color_picture(rendering: Rendering, background: np.ndarray) -> np.ndarray:
 
 
 def picture(name: str, value: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Convert one pass of a rendering to an 8-bit RGB or grey picture. `maps` returns the names and values.
+    """Convert one map of a rendering to an 8-bit RGB or grey picture.
+
+    `name` and `value` are an entry of the dictionary that `maps` returns, or "doubt" and a map (H, W) of the doubt.
 
     - color: composited over white
     - albedo: sRGB-encoded
     - normal: n/2 + 1/2; black where `alpha` is 0.5 or less
     - depth: divided by its maximum
-    - doubt: the colour TOLD for 0, DOUBTFUL for 1, mixed in between; black where `alpha` is 0.5 or less
+    - doubt, which is 0..1, how little the photos tell metal from paint: mixed from the colours TOLD (for 0) and DOUBTFUL (for 1); black
+      where `alpha` is 0.5 or less
     - others: only converted from 0..1 to 8 bits
     """
     if name == "color":
