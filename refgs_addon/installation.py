@@ -291,9 +291,9 @@ def _uv_environment(home: Path) -> dict[str, str]:
 
     uv downloads a Python of its own for the trainer. Blender's Python or the system's would not do, because an update may replace it.
 
-    UV_TORCH_BACKEND is "auto": uv chooses the build of torch for this machine's GPU. Some mirrors need torch from the package index
-    instead. For these, the user sets UV_TORCH_BACKEND to "", and this function removes the variable. It also removes all variables whose
-    names begin with PYTHON.
+    UV_TORCH_BACKEND is "auto": uv chooses the build of torch for this machine's GPU. With some package mirrors, torch must come from the
+    package index instead. For these, the user sets UV_TORCH_BACKEND to "", and this function removes the variable. It also removes all
+    variables whose names begin with PYTHON.
     """
     set_here = {"UV_TORCH_BACKEND": "auto", "UV_PYTHON_INSTALL_DIR": str(home / "python")}
     if not os.environ.keys() & {

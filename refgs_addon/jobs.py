@@ -281,8 +281,8 @@ def make_masks(
 ) -> Job:
     """Start a job that makes masks for a capture's photos, then does the same as `check`. It does not wait for other jobs.
 
-    `settings` may have a box about the object, as for `train`. `model` is an ONNX file that finds the object in a photo. Raises InputError
-    if another job already makes the masks of this capture.
+    `settings` may have the settings of a box around the object, such as `region.size`. `model` is an ONNX file that finds the object in a
+    photo; None stands for the trainer's own method. Raises InputError if another job already makes the masks of this capture.
     """
     kind = {"command": "masks", "capture": str(capture)}
     if any(not job.ended and job.commands and kind.items() <= job.commands[0].items() for job in JOBS):
@@ -441,7 +441,7 @@ def poll() -> bool:
 def trainings() -> list[Job]:
     """List the jobs that train runs or make their meshes, both running and waiting. Only these jobs can continue after Blender closes.
 
-    A batch (the training of many captures) is one of them.
+    Batches, which train many captures, are among them.
     """
     return [job for job in JOBS if job.run and not job.ended]
 

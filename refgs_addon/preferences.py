@@ -128,7 +128,7 @@ def _folder(name: str) -> Path:
 
 
 def query_trainer() -> None:
-    """Start a job that asks the chosen Python for the version of its trainer. `status` then shows the answer."""
+    """Start a job that asks the trainer for its version and GPU. `status` then shows the answer. Does nothing if no trainer is set up."""
     forget_queries()
     if set_up():
         _own_jobs.append(jobs.query_trainer(python(), log_file("trainer")))
@@ -180,7 +180,7 @@ def installing() -> jobs.Job | None:
 
 
 def status() -> tuple[str, str]:
-    """Return an icon and one line that describe the trainer's status."""
+    """Return the name of an icon, and one line for the artist, that describe the trainer's status."""
     job = _own_jobs[0] if _own_jobs else None
     if job and job.state == "failed":
         return "ERROR", job.line[0].upper() + job.line[1:]

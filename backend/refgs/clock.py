@@ -1,10 +1,10 @@
 """Measure how much time each part of a training takes.
 
-The decorator `timed` names a function, or an autograd Function, as a part. While `Clock.iteration` is active, the run time of its calls is
-added to that part. A part that is called inside another part counts for the outer one only.
+A part is a function, or an autograd Function, to which the decorator `timed` gives a name. While `Clock.iteration` is active, the run time
+of its calls is added to the part's total. A part that is called inside another part counts for the outer one only.
 
-On the CPU every iteration is measured, which takes about 25 µs each time. A GPU runs asynchronously. There only one in `SAMPLED`
-iterations is measured, by CUDA events, and its times are multiplied by `SAMPLED`.
+On the CPU every iteration is measured, which takes about 25 µs each time. A GPU runs asynchronously. There only one in `SAMPLED` iterations
+is measured, by CUDA events, and its times are multiplied by `SAMPLED`.
 """
 
 import functools

@@ -18,7 +18,8 @@ class InputError(Exception):
     """Error in the user's input.
 
     The message is one line for the user: what is wrong, where, and what to do. The command line prints only this line and exits with status
-    2. Any other exception is a bug of the program: it exits with status 1, and the traceback is written to log.txt.
+    2. Any other exception is a bug of the program: the command line prints its traceback and exits with status 1. A training also writes
+    the traceback to log.txt in the run folder.
     """
 
     def __str__(self) -> str:

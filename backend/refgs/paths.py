@@ -43,8 +43,8 @@ _TEMPORARY = re.compile(r"\.refgs-[0-9a-f]{16}\.tmp")
 def whole(path: str | os.PathLike, durable: bool = True) -> Iterator[Path]:
     """Write a file completely or not at all.
 
-    Yields a temporary file, empty and in the same folder, to write to. It is renamed to `path` at the end of the `with` block, or deleted
-    if the block raises an error. A killed process leaves it behind: see `remove_leftovers`.
+    Yields the path of an empty temporary file in the same folder, to write to. The file is renamed to `path` at the end of the `with`
+    block, or deleted if the block raises an error. A killed process leaves it behind: see `remove_leftovers`.
 
     The file is on the disk when the block ends, so that it outlives a power failure. `durable=False` saves the milliseconds that this
     takes, for files that nobody needs after a power failure.
@@ -108,7 +108,7 @@ def _sync(path: Path, flags: int) -> None:
 
 
 def write_text(file: Path, text: str, durable: bool = True) -> None:
-    """Write a text file in UTF-8, completely or not at all. `durable` is as for `whole`."""
+    """Write a UTF-8 text file completely or not at all. With `durable`, it outlives a power failure (see `whole`)."""
     with whole(file, durable) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

@@ -79,7 +79,7 @@ def check_current_folder() -> None:
 def check_arguments() -> None:
     """Raise InputError if a command-line argument is not Unicode, or cannot be decoded because the system's encoding is ASCII.
 
-    Libraries fail at such a name of a file.
+    Many libraries cannot open a file with such a name.
     """
     for word in sys.argv[1:]:
         try:

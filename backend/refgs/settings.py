@@ -248,7 +248,7 @@ class DensifySettings(_Section):
 
 
 class PropagationSettings(_Section):
-    """Normal propagation (Ref-Gaussian paper, §3.3). At intervals, shiny metal surfels grow and so pass on their normals."""
+    """Material-aware normal propagation (Ref-Gaussian, §3.3). At intervals, shiny metal surfels grow and so pass on their normals."""
 
     every: int = Field(ge=0, description="iterations between passes; 0: none")
     stop: float = Field(ge=0, le=1, description="end, a part of the training")
@@ -349,7 +349,7 @@ def parse_change(text: str) -> Assignment:
 def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
     """Make `Settings` from the tables of settings that a run recorded. `source` names their file in error messages.
 
-    Keys that the run's release did not have yet get the standard preset's value, or the value that keeps what that release did.
+    A key that is newer than the run's release gets the standard preset's value, or the value that works as that release did.
     """
     # Before these keys existed, light was fixed to the world, there were no exposures and no residual, and nothing was left out.
     still = {"light": {"frame": "world", "exposure": "off"}, "residual": {"start": 1.0}}

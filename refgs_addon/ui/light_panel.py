@@ -142,7 +142,7 @@ CLASSES = (Relight, RecoveredLight, MatchLight, LightPanel)
 
 @bpy.app.handlers.persistent
 def _follow_world(scene: bpy.types.Scene, *_) -> None:
-    """Update the diffuse light of imported runs if the world was rotated or replaced.
+    """Update the diffuse light that imported runs have in Eevee, if the world was rotated or replaced.
 
     Blender calls this after every change of the scene and of the frame.
     """

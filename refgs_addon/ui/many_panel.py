@@ -1,6 +1,6 @@
 """Draw the panel Train Many, below the panel Train, and define its operators.
 
-The panel trains all captures in a folder, which is called a batch, and shows a table with a row for each run.
+A batch is the training of all captures in a folder. The panel starts a batch, and shows a table with a row for each run.
 """
 
 import time
@@ -156,7 +156,7 @@ def _draw_batch(box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
 
 
 def _draw_other_process(box: bpy.types.UILayout, context: bpy.types.Context, folder: Path) -> None:
-    """Draw the progress of a batch (the training of many captures) that another process runs, such as a terminal's, and a Stop button.
+    """Draw the progress of a batch (the training of many captures) that another process runs, and a button that stops the batch.
 
     `folder` is the folder of the batch's runs.
     """
@@ -189,7 +189,10 @@ def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, folder: 
 
 
 def _draw_library(box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
-    """Draw the job that turns runs into assets for the asset browser."""
+    """Draw the progress or the result of a job that turns runs into assets for the asset browser.
+
+    `width` is how many letters fit into a line.
+    """
     row = box.row()
     row.label(text=job.name, icon={"done": "CHECKMARK", "failed": "ERROR"}.get(job.state, "SORTTIME"))
     row.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).serial = job.serial

@@ -147,9 +147,9 @@ def normal_ssim(normals: np.ndarray, reference: np.ndarray, alpha: np.ndarray, r
 
 
 def channel_products(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Compute three means for each colour channel, over the pixels in `mask` (h, w): of image², image · reference and reference².
+    """Compute three means for each colour channel over the pixels in `mask` (h, w). `aligned_psnr` needs them from every view.
 
-    Returns (3, channels), one row for each mean. `aligned_psnr` needs them from every view.
+    They are the means of image², image · reference and reference². Returns (3, channels), one row for each mean.
     """
     a, b = image[mask].astype(np.float64), reference[mask].astype(np.float64)
     return np.stack([(a * a).mean(0), (a * b).mean(0), (b * b).mean(0)])

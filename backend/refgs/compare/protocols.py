@@ -18,8 +18,8 @@ MOST_RADIANCE = 4.0  # Stanford-ORB clips radiance here for PSNR-H
 def albedo_ratio(pairs: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     """Compute TensoIR's correction of base colour: a factor for each channel (3,), the median of true divided by rendered values.
 
-    `pairs` has a pair for each view: the rendered and the true linear base colours (N, 3) of the object's pixels. The median is over all
-    views.
+    `pairs` has a pair for each view: the rendered and the true linear base colours (N, 3) of the object's pixels. The median is over the
+    pixels of all views.
     """
     rendered, true = (np.concatenate(part) for part in zip(*pairs, strict=True))
     return np.median(true / np.maximum(rendered, 1e-6), axis=0)

@@ -71,7 +71,7 @@ class TensoIRTruth(GroundTruth):
 class StanfordORBTruth(GroundTruth):
     """Read the true normals, depths and base colour of a scene of Stanford-ORB, and photos of its object under the lights of other scenes.
 
-    `folder` is the scene's folder. There are true maps for its test photos. Their files hold normals in OpenGL's camera axes
+    `folder` is the scene's folder. Its test photos have true maps. The files of these maps hold normals in OpenGL's camera axes
     (`scripts/preprocess/mesh_to_depth.py` in Stanford-ORB's repository), and base colour sRGB-encoded (`orb/utils/test.py`).
     """
 

@@ -88,9 +88,9 @@ class GroundTruth:
         return pixels[..., :3]
 
     def panorama(self, name: str) -> np.ndarray:
-        """Read the light in the file NAME.exr. Return a panorama (H, W, 3), rotated to the coordinates of the training.
+        """Read the light in the file `name`.exr; `name` is "light" or "relight/HDRI". Return a panorama (H, W, 3) of linear radiance.
 
-        The panorama is equirectangular, in Blender's orientation.
+        The panorama is equirectangular, in Blender's orientation, and rotated to the coordinates of the training.
         """
         panorama = read_environment(self._light_file(name))
         return sample(panorama, directions(*panorama.shape[:2]) @ self._turn.astype(np.float32))
