@@ -1,6 +1,7 @@
-"""Keep the paths in a .blend relative to it (`//`), so that a copied project works in its own run and capture, not in the original's.
+"""Store the add-on's paths in a .blend file relative to it (`//`), so that a copied project uses its own run and capture.
 
-Paths are absolute while a file is open, and relative only in the file. Blender itself does this for images, but not for properties.
+While a .blend is open, these paths are absolute. They are made relative before it is saved, and absolute afterwards. Blender itself does
+this for images, but not for properties.
 """
 
 import os
@@ -15,7 +16,10 @@ from .scene.strokes import STROKES
 
 
 def _change(change: Callable[[str], str]) -> None:
-    """Change all paths that the add-on stores, other than those of linked data, which are not saved."""
+    """Replace each path that the add-on stores by `change(path)`.
+
+    Data linked from another .blend is left out, because it is not saved in this one.
+    """
     for item, key in _custom_properties():
         item[key] = change(item[key])
     for settings, key in _settings():
@@ -76,7 +80,10 @@ def _after_loading(*_) -> None:
 
 @bpy.app.handlers.persistent
 def _after_appending(context, *_) -> None:
-    """Make the paths of data appended from another .blend absolute. Those are relative to that file; all others are absolute already."""
+    """Make paths absolute in data that was appended from another .blend, where they were relative to that file.
+
+    Paths that were in this .blend before are absolute already, and stay as they are.
+    """
     libraries = [item.source_library for item in context.import_items if item.source_library is not None]
     if libraries:
         start = os.path.dirname(bpy.path.abspath(libraries[0].filepath))

@@ -51,7 +51,10 @@ def node_tree(data: bpy.types.Material | bpy.types.World) -> bpy.types.NodeTree:
 
 
 def modifier_input(modifier: bpy.types.NodesModifier, name: str) -> tuple[bpy.types.bpy_struct, str]:
-    """Find where Blender stores an input of a geometry-nodes modifier. Returns the two arguments for `layout.prop`: owner and property."""
+    """Find where Blender stores an input of a geometry-nodes modifier.
+
+    Returns the data that holds the input, and the name of the property in it: the two arguments for `layout.prop`.
+    """
     identifier = modifier.node_group.interface.items_tree[name].identifier
     if hasattr(modifier, "properties"):  # from 5.2
         return getattr(modifier.properties.inputs, identifier), "value"
@@ -94,7 +97,7 @@ def paint_colors(settings: bpy.types.ToolSettings) -> bpy.types.UnifiedPaintSett
 
 
 def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
-    """List an object's animation curves."""
+    """List the animation curves of an object. The object must be animated."""
     animation = item.animation_data
     if hasattr(animation.action, "fcurves"):  # until 5.0
         return list(animation.action.fcurves)
@@ -103,7 +106,7 @@ def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
 
 
 def usd_materials() -> dict[str, str | bool]:
-    """Return arguments of Blender's USD exporter: it writes MaterialX beside UsdPreviewSurface, and copies no textures.
+    """Return arguments that let Blender's USD exporter write MaterialX beside UsdPreviewSurface, and copy no textures.
 
     The USD file then refers to the existing texture files.
 

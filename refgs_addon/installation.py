@@ -3,7 +3,7 @@
 Blender also runs this file as a separate process. That process reads one command, `install` or `remove`, from stdin, and prints events to
 stdout (docs/job-protocol.md). When Blender ends, stdin closes: the process then kills the program that it has started, and exits.
 
-The packages are those of the release: the add-on's zip has locks with the version and the SHA-256 of every package.
+The installed packages are those of the release: the add-on's zip has lock files with the version and the SHA-256 of every package.
 
 An interrupted installation does no harm. The last step writes a marker file, and without that file the trainer counts as not installed.
 Finished downloads stay in uv's cache for the next installation.
@@ -77,8 +77,9 @@ def python(home: Path) -> Path:
 def needed_bytes() -> float:
     """Estimate the disk space in bytes for the trainer.
 
-    A machine with nvidia-smi needs more, because it may get torch's CUDA build. Linux also needs more if the add-on has locks, but
-    none for the CPU build: torch then comes from the package index, which has only the CUDA build for Linux.
+    A machine with nvidia-smi needs more, because it may get torch's CUDA build. On Linux, any machine needs more if the add-on has lock
+    files (lists of exact package versions), but none for torch's CPU build: torch then comes from the package index, which has only the
+    CUDA build for Linux.
     """
     locked = sys.platform == "linux" and (WHEELS / "lock.txt").is_file() and not (WHEELS / "lock-cpu.txt").is_file()
     return NEEDED_WITH_CARD if locked or shutil.which("nvidia-smi") else NEEDED
@@ -102,7 +103,7 @@ def disk_full_line(home: Path) -> str:
 
 
 def folder_bytes(folder: Path) -> int:
-    """Add up the bytes of the files in a folder."""
+    """Add up the bytes of the files in a folder and its subfolders."""
     total = 0
     for path, _, names in os.walk(folder):
         for name in names:
@@ -217,10 +218,11 @@ def _install(home: Path, uv: Path, trainer: Path) -> None:
 
 
 def _choose_lock(program: Path, variables: dict[str, str], home: Path, locks: Path) -> Path:
-    """Return the lock for the build of torch that uv chooses for this machine.
+    """Return the lock file (versions and hashes of all packages) for the build of torch that uv chooses for this machine.
 
-    A build is named at the end of torch's version, such as 2.14.0+cpu. If there is a lock for that build, return it, and store the build's
-    name in `variables` as UV_TORCH_BACKEND. Otherwise return lock.txt, which is for the package index's build, and delete UV_TORCH_BACKEND.
+    `locks` is the folder of the lock files. A build is named at the end of torch's version, such as 2.14.0+cpu. If there is a lock file for
+    that build, return it, and store the build's name in `variables` as UV_TORCH_BACKEND. Otherwise return lock.txt, which is for the
+    package index's build, and delete UV_TORCH_BACKEND from `variables`.
     """
     lock, wanted = locks / "lock.txt", home / "torch.txt"
     if "UV_TORCH_BACKEND" not in variables or not (pinned := re.search(r"^torch==\S+", lock.read_text(), re.M)):
@@ -253,7 +255,10 @@ def _resolve(program: Path, variables: dict[str, str], home: Path, requirements:
 
 
 def _describe_origin(packages: dict[str, tuple[str, str]]) -> str:
-    """Describe where packages came from. `packages` is what `_resolve` returns."""
+    """Return a sentence for the artist: how many packages came from which host.
+
+    `packages` has (version, index) by package, as `_resolve` returns it.
+    """
     hosts: dict[str, list[str]] = {}
     for name, (version, index) in packages.items():
         hosts.setdefault(urlsplit(index).hostname or index, []).append(f"{name} {version}")
@@ -286,9 +291,9 @@ def _uv_environment(home: Path) -> dict[str, str]:
 
     uv downloads a Python of its own for the trainer. Blender's Python or the system's would not do, because an update may replace it.
 
-    UV_TORCH_BACKEND is "auto": uv chooses the build of torch for this machine's GPU. Some mirrors need torch from the package index
-    instead. For these, the user sets UV_TORCH_BACKEND to "", and this function removes the variable. It also removes all variables whose
-    names begin with PYTHON.
+    UV_TORCH_BACKEND is "auto": uv chooses the build of torch for this machine's GPU. With some package mirrors, torch must come from the
+    package index instead. For these, the user sets UV_TORCH_BACKEND to "", and this function removes the variable. It also removes all
+    variables whose names begin with PYTHON.
     """
     set_here = {"UV_TORCH_BACKEND": "auto", "UV_PYTHON_INSTALL_DIR": str(home / "python")}
     if not os.environ.keys() & {
@@ -362,7 +367,7 @@ def _report_download(home: Path, fetching: dict[str, str], ended: threading.Even
 
 
 def _start_trainer(python: Path) -> None:
-    """Start the installed trainer once. Raises _Failed unless the trainer reports that it is ready."""
+    """Start the installed trainer once to test it, and print the event with its version and GPU. Raises _Failed if it does not start."""
     process = _start([str(python), "-E", "-P", "-m", "refgs.cli", "worker"])
     heard = process.communicate()[0].splitlines()
     event = json.loads(heard[0]) if process.returncode == 0 and heard else {}
@@ -372,7 +377,10 @@ def _start_trainer(python: Path) -> None:
 
 
 def explain_uv_error(text: str, home: str) -> str:
-    """Turn what uv printed into one error message for the artist. Returns "" for an error that the artist cannot fix."""
+    """Turn what uv printed into one error message for the artist. Returns "" if the error is not a known one.
+
+    `home` is the installation folder, which the message names.
+    """
     lower = text.lower()
     if wrong := re.search(r"Hash mismatch for `([^`]+)`", text):
         what = f"{wrong[1]}: the file that was fetched is not the one that was released (its SHA-256 is another)"

@@ -1,4 +1,7 @@
-"""Run two timers. One polls this Blender's jobs. The other watches trainings in other processes. Both redraw Blender's windows."""
+"""Run three timers. They poll this Blender's jobs, watch trainings in other processes, and read a batch's table. All redraw the windows.
+
+A batch is the training of many captures in one job. Its table has a row for each run.
+"""
 
 from pathlib import Path
 
@@ -53,7 +56,10 @@ def _poll_other_processes() -> float | None:
 
 
 def follow_batch(folder: Path) -> None:
-    """Start a timer that reads the table of the batch in a folder, at once and then every two seconds until the batch ends."""
+    """Start a timer that reads the table of a batch (the training of many captures), at once and then every two seconds until it ends.
+
+    `folder` is the folder of the batch's runs.
+    """
     global _batch
     _batch = folder
     if not bpy.app.timers.is_registered(_poll_batch):
@@ -67,7 +73,7 @@ def _poll_batch() -> float | None:
 
 
 def redraw() -> None:
-    """Redraw the panel, the preferences and the status bar."""
+    """Redraw the 3D views, the image editors, the preferences and the status bar."""
     manager = bpy.context.window_manager
     for window in manager.windows if manager else ():
         for area in window.screen.areas:

@@ -281,8 +281,8 @@ def make_masks(
 ) -> Job:
     """Start a job that makes masks for a capture's photos, then does the same as `check`. It does not wait for other jobs.
 
-    `settings` may have a box about the object, as for `train`. `model` is an ONNX file that finds the object in a photo. Raises InputError
-    if another job already makes the masks of this capture.
+    `settings` may have the settings of a box around the object, such as `region.size`. `model` is an ONNX file that finds the object in a
+    photo; None stands for the trainer's own method. Raises InputError if another job already makes the masks of this capture.
     """
     kind = {"command": "masks", "capture": str(capture)}
     if any(not job.ended and job.commands and kind.items() <= job.commands[0].items() for job in JOBS):
@@ -342,7 +342,8 @@ class Asked:
       None, the preset is "standard".
     - `settings` overrides single settings: `{"train.iterations": 2000}`.
     - `resume` continues a stopped training.
-    - `hinted` names a finished run and a file of hints. The training of that run is continued in `out`, with the run's preset and settings.
+    - `hinted` names a finished run, and a file that says which parts of its surface are metal or paint. The training of that run is
+      continued in `out`, with the run's preset and settings.
     """
 
     capture: Path
@@ -398,7 +399,7 @@ def train_many(python: Path, captures: Path, out: Path, log: Path, preset: str) 
 
 
 def export(python: Path, run: Path, log: Path) -> Job:
-    """Start a job that makes the mesh and textures of a run folder. It waits until earlier trainings have ended."""
+    """Start a job that makes the mesh and textures of a run folder. The job waits until earlier trainings have ended."""
     return _add(Job(run.name, python, [{"command": "export", "run": str(run)}], log, run))
 
 
@@ -427,7 +428,7 @@ def _add(job: Job) -> Job:
 
 
 def poll() -> bool:
-    """Handle all new events and start the next job. Returns True if anything changed."""
+    """Handle the new events of all jobs, and start the jobs that need not wait any longer. Returns True if anything changed."""
     changed = [job.poll() for job in JOBS]
     busy = any(job.run and job.active for job in JOBS)
     for job in JOBS:
@@ -438,7 +439,10 @@ def poll() -> bool:
 
 
 def trainings() -> list[Job]:
-    """List the jobs that train a run or make its mesh, both running and waiting. Only these jobs can continue after Blender closes."""
+    """List the jobs that train runs or make their meshes, both running and waiting. Only these jobs can continue after Blender closes.
+
+    Batches, which train many captures, are among them.
+    """
     return [job for job in JOBS if job.run and not job.ended]
 
 
@@ -501,7 +505,10 @@ def stop_requested(folder: Path) -> bool:
 
 
 def _locked(file: Path) -> bool:
-    """Check whether a process holds a lock on a file. The system frees the lock when that process ends."""
+    """Check whether a process holds a lock on a file. The system frees the lock when that process ends.
+
+    A file that this user may not open, such as another user's, counts as locked.
+    """
     try:
         descriptor = os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))  # a pipe is not waited for
     except PermissionError:  # another user's

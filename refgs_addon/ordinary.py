@@ -1,4 +1,4 @@
-"""Open files that others wrote: only ordinary ones. A pipe or a device may have no end, and Blender would wait for it."""
+"""Open files that others wrote, but only regular files. A pipe or a device may have no end, and Blender would wait for it."""
 
 import errno
 import json
@@ -14,7 +14,10 @@ LARGEST = 64 << 20  # bytes of a text file
 
 
 def check_file(path: Path) -> None:
-    """Raise OSError if a path leads to no ordinary file, or to an empty one. Linux's /proc has files that count as empty and never end."""
+    """Raise OSError unless a path leads to a regular file that is not empty.
+
+    Linux's /proc has regular files whose size is 0, but which may have no end.
+    """
     facts = os.stat(path)
     if not stat.S_ISREG(facts.st_mode):
         raise OSError(errno.EINVAL, "this is not a file", str(path))
@@ -23,13 +26,17 @@ def check_file(path: Path) -> None:
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open an ordinary file to read its bytes. Raises OSError if it cannot be read, is no such file, or is empty."""
+    """Open a regular file to read its bytes. Raises OSError if it cannot be read, is not a regular file, or is empty."""
     check_file(path)
     return open(path, "rb")
 
 
 def read_text(path: Path) -> str:
-    """Read a file in UTF-8. Raises OSError if it cannot be read, and ValueError if it is no text or has more than LARGEST bytes."""
+    """Read a UTF-8 text file.
+
+    Raises OSError if it cannot be read, is not a regular file, or is empty. Raises ValueError if it is not UTF-8, or has more than LARGEST
+    bytes.
+    """
     with open_file(path) as file:
         data = file.read(LARGEST + 1)
     if len(data) > LARGEST:
@@ -38,9 +45,10 @@ def read_text(path: Path) -> str:
 
 
 def check_gltf(path: Path) -> None:
-    """Raise InputError if a glTF file names files that are not beside it. Blender's importer would open them, wherever they are.
+    """Raise InputError if a glTF file refers to files outside its folder. Blender's importer would open them, wherever they are.
 
-    The file is binary or text. A URI may hold data, or be a relative path without "..".
+    A URI in the file, which is binary or text, may hold data, or be a relative path without "..". Also raises InputError if the file is
+    broken, or if a file that it refers to is missing or empty.
     """
     try:
         with open_file(path) as file:

@@ -1,4 +1,7 @@
-"""Read PLY files (Turk 1994) without bpy. The trainer reads the same files, which tests/makers/plys.py lists."""
+"""Read PLY files (Turk 1994) without bpy.
+
+The trainer has another reader. Both must accept and refuse the same files: tests/makers/plys.py lists them.
+"""
 
 import itertools
 import os
@@ -63,7 +66,10 @@ def read_header(path: Path) -> tuple[list[list[str]], int]:
 
 
 def _parse(lines: list[list[str]], path: Path) -> tuple[str, list[Element]]:
-    """Return the byte order that a header names, "" for text, and its elements."""
+    """Parse the lines of a header, which `read_header` returns. Raises InputError if they are wrong.
+
+    Returns the byte order of the rows, "<" or ">", or "" for a text file. Also returns the elements.
+    """
     if (
         lines[0] != ["ply"]
         or len(lines) < 2
@@ -99,9 +105,10 @@ def _parse(lines: list[list[str]], path: Path) -> tuple[str, list[Element]]:
 
 
 def _check_size(file: BinaryIO, order: str, elements: list[Element], path: Path) -> None:
-    """Raise InputError if a file's length does not fit its header. This is done before memory is reserved for the rows.
+    """Raise InputError if a file is truncated, or has more rows than its header says. Call this before memory is reserved for the rows.
 
-    The length of a list is not in the header: only the number that gives it is counted.
+    `order` is the byte order, "" for text. The header does not say how long lists are. So a list counts only with the bytes of its length,
+    and a binary file with lists is not checked for surplus rows.
     """
     start = file.tell()
     there, need, last = os.fstat(file.fileno()).st_size - start, 0, 0
@@ -173,7 +180,10 @@ def _length(value: float) -> int:
 
 
 def _number(kind: str, word: bytes | str) -> float | int:
-    """Parse a number of the PLY type `kind`. Raises ValueError if it does not fit the type, or if `word` is empty: the line is short."""
+    """Parse a number of the PLY type `kind`.
+
+    Raises ValueError if `word` is no such number, or if it is empty, which means that the line has too few numbers.
+    """
     types = np.dtype(PLY_TYPES[kind])
     if not word:
         raise ValueError("early end of line")

@@ -68,7 +68,7 @@ def preferences() -> Preferences:
 
 
 def set_up() -> bool:
-    """Check whether a trainer is installed or a Python is chosen."""
+    """Return True if the trainer is installed, or if the artist has chosen a Python that should have it."""
     addon = bpy.context.preferences.addons.get(PACKAGE)
     return addon is not None and bool(addon.preferences.python or installation.installed(home()))
 
@@ -94,12 +94,12 @@ def hdri_folder() -> Path | None:
 
 
 def mask_model() -> Path | None:
-    """Return the path of the artist's model for masks, or None if none is chosen."""
+    """Return the path of the artist's own ONNX model that finds the object in a photo, for masks. Return None if none is chosen."""
     return Path(bpy.path.abspath(preferences().mask_model)) if preferences().mask_model else None
 
 
 def log_file(name: str) -> Path:
-    """Return the path of a job's log."""
+    """Return the path of the log of the job `name`."""
     return _folder("logs") / f"{name}.txt"
 
 
@@ -109,7 +109,10 @@ def capture_folder(capture: Path) -> Path:
 
 
 def hints_file(run: Path) -> Path:
-    """Return the path of the file with a run's hints. The file stays when Blender closes, because the training may read it later."""
+    """Return the path of a run's hints: a file that says which parts of the object are metal or paint. `run` is the run folder.
+
+    The file stays when Blender closes, because the training may read it later.
+    """
     return _folder("hints") / f"{run.name} {crc32(str(run).encode()):08x}.json"
 
 
@@ -125,7 +128,7 @@ def _folder(name: str) -> Path:
 
 
 def query_trainer() -> None:
-    """Start a job that asks the chosen Python for the version of its trainer. `status` then shows the answer."""
+    """Start a job that asks the trainer for its version and GPU. `status` then shows the answer. Does nothing if no trainer is set up."""
     forget_queries()
     if set_up():
         _own_jobs.append(jobs.query_trainer(python(), log_file("trainer")))
@@ -177,7 +180,7 @@ def installing() -> jobs.Job | None:
 
 
 def status() -> tuple[str, str]:
-    """Return an icon and one line that describe the trainer's status."""
+    """Return the name of an icon, and one line for the artist, that describe the trainer's status."""
     job = _own_jobs[0] if _own_jobs else None
     if job and job.state == "failed":
         return "ERROR", job.line[0].upper() + job.line[1:]

@@ -50,7 +50,10 @@ class Many(bpy.types.PropertyGroup):
 
 
 class BatchRow(bpy.types.PropertyGroup):
-    """Hold a row of a batch's table, with the fields of `scene.batch_table.Row`. Rows are not saved in the .blend file."""
+    """Hold a row of the table of a batch (the training of many captures), with the fields of `scene.batch_table.Row`.
+
+    Rows are not saved in the .blend file.
+    """
 
     name: StringProperty()
     state: StringProperty()
@@ -178,5 +181,5 @@ def _longest_side(item: bpy.types.Object) -> float:
 
 
 def _scale_to(item: bpy.types.Object, metres: float) -> None:
-    """Scale the Empty of an imported run by one factor until its longest side has this length in metres."""
+    """Scale the Empty of an imported run uniformly, so that the run's longest side becomes `metres` long."""
     item.scale *= metres / max(_longest_side(item), 1e-12)

@@ -5,8 +5,8 @@ the first Blender. The commands:
 
 - {"command": "render", "png": …, "hdris": […], "size": …, "samples": …} renders the .blend that is open. With HDRIs it renders a contact
   sheet: the view under each light. Without HDRIs it renders the scene camera's view.
-- {"command": "library", "folder": …, "runs": [{"name": …, "picture": …}]} saves runs of the batch in `folder` as
-  Blender assets.
+- {"command": "library", "folder": …, "runs": [{"name": …, "picture": …}]} saves runs as Blender assets. `folder` holds the runs of a batch,
+  the training of many captures.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Record what a training was asked for. The command line, the job protocol and batches make this record, and training reads it."""
+"""Define the request for a training. The command line, the job protocol and batches make one, and `refgs.train_job` carries it out."""
 
 import math
 from dataclasses import dataclass, replace
@@ -11,11 +11,12 @@ from refgs.settings import Assignment, Settings, parse_change, preset_settings
 
 @dataclass(frozen=True)
 class Asked:
-    """Hold what `refgs train` was asked for. Raises InputError if the arguments are wrong, or do not go together.
+    """Hold the request for a training, as `refgs train` takes it. Raises InputError if values are wrong or exclude each other.
 
     - `capture` is the folder of photos and cameras, `out` the run folder.
     - `minutes` limits the whole job; pauses do not count. Without a `preset`, all settings are chosen to fit into that time. If neither
       `preset` nor `minutes` is given, the preset is `standard`.
+    - `device` is `auto`, `cpu` or `cuda`.
     - `changes` are settings that differ from the preset's, each written `section.key=value`.
     - `resume` continues the stopped training in `out`, with that training's settings.
     - `run` is a finished run. Its training is continued in `out`, with its settings. `hints` is the file that says which parts of the run's
@@ -49,12 +50,12 @@ class Asked:
 
     @property
     def planned(self) -> bool:
-        """Tell whether all settings are chosen to fit into a time. Not so if a run is continued with hints: the run keeps its settings."""
+        """Return True if all settings are chosen to fit into `minutes`. A run that is continued with hints keeps its settings instead."""
         return self.preset is None and self.minutes is not None and self.hints is None
 
     @property
     def preset_name(self) -> str:
-        """Return the preset as run.toml records it: its name, or the time that the settings are chosen for, as "5 minutes"."""
+        """Return the preset as run.toml records it: its name, or the time that all settings are chosen for, such as "5 minutes"."""
         return f"{self.minutes:g} minutes" if self.planned else self.preset or "standard"
 
     @cached_property
@@ -64,7 +65,7 @@ class Asked:
     def settings(self, preset: str | None = None) -> Settings:
         """Load the preset with the changes. `preset` replaces the preset asked for. Raises InputError if a setting is wrong.
 
-        If the settings are chosen for a time, they are not known yet: the preset `standard` stands for them.
+        If the settings are to be chosen for a time, they are not known yet. The preset `standard` is then loaded in their place.
         """
         return preset_settings(preset or self.preset or "standard", self._assignments)
 
@@ -73,7 +74,7 @@ class Asked:
         return replace(self, changes=(), resume=True, run=None, hints=None)
 
     def words(self) -> list[str]:
-        """Return the command line of this training, without `refgs`."""
+        """Return the command-line arguments that ask for this training, without the program's name `refgs`."""
         words = ["train", str(self.capture), "--out", str(self.out), "--device", self.device]
         if self.preset:
             words += ["--preset", self.preset]

@@ -202,7 +202,7 @@ def batch(
         str | None, typer.Option(help="HOST:PORT of a Ray cluster's head", show_default="this machine")
     ] = None,
 ) -> None:
-    """Train many captures: find cameras, make masks, train, evaluate and export each. Run it again to go on, or to add captures."""
+    """Train many captures: find cameras, make masks, train, evaluate and export each. Run it again to resume, or to add captures."""
     from refgs import commands
 
     commands.batch(source, out, preset, minutes, changes or [], device, cores, workers, address)
@@ -260,7 +260,7 @@ def _terminate(*_) -> None:
 
 
 def _end_with_input() -> None:
-    """End this process by SIGTERM when its standard input closes: the process that started it has died."""
+    """End this process by SIGTERM when its standard input closes, which means that the process that started it has died."""
     while os.read(0, 1024):
         pass
     terminate()
@@ -279,7 +279,9 @@ def _one_line(show):
 
 
 def main() -> None:
-    """Run a command. Its exit status is one of STATUSES; an error prints one line, a fault of the program a traceback.
+    """Run the command that the arguments name, and exit with one of STATUSES.
+
+    An error in the input is printed as one line. A bug of the program is printed as a traceback.
 
     If the environment has REFGS_END_WITH_INPUT, the command also ends when its standard input closes. `refgs batch` sets it for the
     commands that it starts.

@@ -1,10 +1,10 @@
 """Measure how much time each part of a training takes.
 
-The decorator `timed` names a function, or an autograd Function, as a part. While `Clock.iteration` is active, the run time of its calls is
-added to that part. A part that is called inside another part counts for the outer one only.
+A part is a function, or an autograd Function, to which the decorator `timed` gives a name. While `Clock.iteration` is active, the run time
+of its calls is added to the part's total. A part that is called inside another part counts for the outer one only.
 
-On the CPU every iteration is measured, which takes about 25 µs each time. A GPU runs asynchronously. There only one in `SAMPLED`
-iterations is measured, by CUDA events, and its times are multiplied by `SAMPLED`.
+On the CPU every iteration is measured, which takes about 25 µs each time. A GPU runs asynchronously. There only one in `SAMPLED` iterations
+is measured, by CUDA events, and its times are multiplied by `SAMPLED`.
 """
 
 import functools
@@ -22,8 +22,8 @@ _watching: "Clock | None" = None
 class Clock:
     """Add up the seconds that a device spends in each part of a training.
 
-    `seconds` maps a part's name to its total. `processor` is the CPU time of all threads in all iterations, in seconds. Other programs
-    hardly change it.
+    `seconds` maps a part's name to its total. `processor` is the CPU time of all threads in all iterations, in seconds. Unlike run time,
+    CPU time hardly depends on other programs.
     """
 
     def __init__(self, device: torch.device):
@@ -33,7 +33,10 @@ class Clock:
         self._events: list[tuple[str, torch.cuda.Event, torch.cuda.Event]] = []
 
     def resume(self, seconds: dict[str, float], processor: float) -> None:
-        """Take over times from the checkpoint of an interrupted training: `seconds` are added by part, and `processor` is replaced."""
+        """Continue from the times in the checkpoint of an interrupted training.
+
+        `seconds`, by part, are added to those measured so far. `processor` replaces the CPU time measured so far.
+        """
         self.processor = processor
         for name, value in seconds.items():
             self._add(name, value)
@@ -91,7 +94,7 @@ class Clock:
 
 
 def _event() -> torch.cuda.Event:
-    """Put an event into the GPU's queue, and return it. The event takes the time when the GPU reaches it."""
+    """Put an event into the GPU's queue, and return it. The GPU records the time when it reaches the event."""
     event = torch.cuda.Event(enable_timing=True)
     event.record()
     return event

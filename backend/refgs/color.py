@@ -50,7 +50,8 @@ def _functions(values: Values) -> tuple[Callable[..., Any], Callable[..., Any]]:
 def primaries_to_rec709(chromaticities: Sequence[float]) -> np.ndarray:
     """Return the matrix (3, 3) from linear RGB of other primaries to linear Rec.709. White stays white (Bradford's adaptation).
 
-    `chromaticities` are x and y of red, green, blue and white. Raises ValueError if they span no colours.
+    `chromaticities` are x and y of red, green, blue and white. Raises ValueError if there is no finite matrix, as when the primaries lie on
+    one line.
     """
     with np.errstate(all="ignore"):
         matrix = pcs_to_rec709() @ _to_pcs(chromaticities)
@@ -65,7 +66,10 @@ def pcs_to_rec709() -> np.ndarray:
 
 
 def _to_pcs(chromaticities: Sequence[float]) -> np.ndarray:
-    """Return the matrix (3, 3) from linear RGB of these primaries to XYZ, adapted to D50."""
+    """Return the matrix (3, 3) from linear RGB to XYZ, adapted to the white D50 (Bradford's adaptation).
+
+    `chromaticities` are x and y of the primaries red, green and blue, and of white.
+    """
     x, y = np.reshape(np.asarray(chromaticities, np.float64), (4, 2)).T
     xyz = np.stack([x / y, np.ones(4), (1 - x - y) / y])  # red, green, blue, white, each of luminance 1
     primaries, white = xyz[:, :3], xyz[:, 3]

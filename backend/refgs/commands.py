@@ -29,7 +29,7 @@ PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha"
 
 @contextmanager
 def progress_bar(what: str, total: int):
-    """Show a progress bar with the estimated time left, for a `with` block.
+    """Show a progress bar with the estimated time left during a `with` block.
 
     Yields a function update(done, note, total) that moves the bar and shows the text `note`.
     """
@@ -106,8 +106,8 @@ def poses(folder: Path, once: bool = False) -> None:
 def masks(folder: Path, changes: list[str], model: Path | None = None, once: bool = False) -> None:
     """Make masks of a capture's photos, and write them to its folder `masks`.
 
-    `changes` set the box around the object. `model` is an ONNX file that finds the object's pixels; without it, colours are used. With
-    `once`, nothing is done if any photo has a mask already.
+    `changes` are settings of a box around the object, such as `region.size=[1,1,2]`. `model` is an ONNX file that finds the object's
+    pixels; without it, colours are used. With `once`, nothing is done if any photo has a mask already.
     """
     from refgs.capture import read_capture
     from refgs.capture.masks import make_masks
@@ -127,8 +127,8 @@ def train(asked: Asked, once: bool = False) -> None:
     """Train on a capture and write a run folder, or resume the training in it.
 
     Ctrl-C ends the training with a checkpoint, from which it can be resumed. A second Ctrl-C ends it at once. SIGTERM also ends it with a
-    checkpoint. If writing that takes longer than CHECKPOINT_BY seconds, the training ends without it and can be resumed from the checkpoint
-    before.
+    checkpoint. If this checkpoint is not complete CHECKPOINT_BY seconds after SIGTERM, the training ends without it, and can be resumed
+    from the checkpoint before.
 
     With `once`, a training that has ended is left as it is; any other is started or resumed. Its settings must be those of the first call.
     """
@@ -242,7 +242,7 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
 
 
 def _check_passes(run, passes: list[str], format: str) -> None:
-    """Raise InputError if a requested pass, such as "albedo", does not exist in the run."""
+    """Raise InputError if the run cannot give a requested pass, such as "albedo", in this file format."""
     without = {"albedo", "roughness", "metallic"} if run.environment is None else set()
     without |= {"visibility"} if run.occluder is None else set()
     if missing := [name for name in passes if name in without]:
@@ -341,7 +341,7 @@ def batch(
 ) -> None:
     """Train many captures, on this machine or on a cluster, and write a page about them.
 
-    Ctrl-C and SIGTERM end all commands, each training with a checkpoint. The same command resumes them.
+    Ctrl-C and SIGTERM end the whole batch. Trainings end with a checkpoint. The same command resumes the batch.
     """
     from refgs.batch.batch import ready
     from refgs.batch.listing import Ask
@@ -365,9 +365,9 @@ def batch(
 
 @contextmanager
 def _batch_bars() -> Iterator[Callable[[str, dict], None]]:
-    """Show a bar for all trainings of a batch and one for each step that runs, for a `with` block.
+    """Show progress bars during a `with` block: one for the whole batch, and one for each step that runs.
 
-    Yields the function report(event, facts).
+    Yields the function report(event, facts) that the batch must call.
     """
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}")
     with Progress(*columns, console=console, transient=True) as progress:

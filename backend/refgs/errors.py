@@ -10,7 +10,7 @@ _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def one_line(message: object) -> str:
-    """Return a message as one line that every terminal can print: what cannot be printed, such as a newline, is escaped as Python does."""
+    """Return a message as one line that every terminal can print. Characters that cannot be printed, such as newlines, are escaped."""
     return _UNPRINTABLE.sub(lambda found: repr(found[0])[1:-1], str(message))
 
 
@@ -18,7 +18,8 @@ class InputError(Exception):
     """Error in the user's input.
 
     The message is one line for the user: what is wrong, where, and what to do. The command line prints only this line and exits with status
-    2. Any other exception is a bug of the program: it exits with status 1, and the traceback is written to log.txt.
+    2. Any other exception is a bug of the program: the command line prints its traceback and exits with status 1. A training also writes
+    the traceback to log.txt in the run folder.
     """
 
     def __str__(self) -> str:
@@ -26,7 +27,7 @@ class InputError(Exception):
 
 
 class TryAgain(InputError):
-    """Error that is not the input's fault: a full disk, a card that fails, a run folder that another process is using.
+    """Error that is not the input's fault: a full disk, a GPU that fails, a run folder that another process is using.
 
     The same command may succeed later. The command line exits with the status TRY_AGAIN.
     """

@@ -22,8 +22,8 @@ EVERY = 1.0  # seconds between looks
 class RunLock:
     """Lock a run folder for this process during a `with` block.
 
-    Raises TryAgain if another process has locked it, or if the lock cannot be opened: it is another user's, or the disk is full. On a file
-    system without locks, nothing is locked.
+    Raises TryAgain if another process has locked it, or if the lock file cannot be opened, because it is another user's or the disk is
+    full. On a file system without locks, nothing is locked.
 
     Half-written files that killed processes left in the folder are removed. A folder that does not exist is made.
     """
@@ -57,7 +57,7 @@ class RunLock:
     def attend(self, iteration: int, total: int, seconds: float) -> bool:
         """Write the training's progress to progress.json. Return True if another process has asked this one to stop.
 
-        Call this in every iteration: it does its work once a second and otherwise returns False. `seconds` is the time spent so far,
+        Call this in every iteration. It writes and checks once a second, and otherwise returns False. `seconds` is the time spent so far,
         `total` the number of all iterations.
         """
         now = time.monotonic()
@@ -91,7 +91,10 @@ class RunLock:
 
 
 def remove_stale_lock(folder: Path) -> None:
-    """Remove the lock and the half-written files of a process that was killed at the very end of its work."""
+    """Remove the lock file and the half-written files that a killed process left in a folder.
+
+    Does nothing if another process has locked the folder.
+    """
     if (folder / LOCK).exists():
         with suppress(TryAgain), RunLock(folder):
             pass

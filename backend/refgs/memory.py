@@ -16,9 +16,9 @@ LESS = "close other programs, or ask for less: smaller photos, fewer surfels, sm
 
 
 def trim() -> None:
-    """Return freed memory to the system. When thousands of tensors have been freed, glibc may still keep gigabytes for later.
+    """Return freed memory to the system. On systems other than Linux, do nothing.
 
-    On other systems, nothing is done.
+    When thousands of tensors have been freed, Linux's C library glibc may still keep gigabytes for later.
     """
     if sys.platform == "linux":
         release = getattr(ctypes.CDLL(None), "malloc_trim", None)  # absent in musl
@@ -45,7 +45,10 @@ def shortage_named(lower: str = LESS) -> Iterator[None]:
 
 
 def check_limit() -> None:
-    """Raise TryAgain if the system lets this process reserve less than LEAST: libraries crash then, or hang, without a word."""
+    """Raise TryAgain if the system limits the memory of this process (`ulimit -v`) to less than LEAST bytes.
+
+    With less, libraries crash or hang without an error message.
+    """
     if 0 <= (limit := _limit()) < LEAST:
         least = f"{LEAST / 1e9:.0f} GB, most of it for libraries"
         raise TryAgain(

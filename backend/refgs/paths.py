@@ -43,8 +43,8 @@ _TEMPORARY = re.compile(r"\.refgs-[0-9a-f]{16}\.tmp")
 def whole(path: str | os.PathLike, durable: bool = True) -> Iterator[Path]:
     """Write a file completely or not at all.
 
-    Yields a temporary file, empty and in the same folder, to write to. It is renamed to `path` at the end of the `with` block, or deleted
-    if the block raises an error. A killed process leaves it behind: see `remove_leftovers`.
+    Yields the path of an empty temporary file in the same folder, to write to. The file is renamed to `path` at the end of the `with`
+    block, or deleted if the block raises an error. A killed process leaves it behind: see `remove_leftovers`.
 
     The file is on the disk when the block ends, so that it outlives a power failure. `durable=False` saves the milliseconds that this
     takes, for files that nobody needs after a power failure.
@@ -71,7 +71,10 @@ def whole(path: str | os.PathLike, durable: bool = True) -> Iterator[Path]:
 
 
 def _replace(source: Path, target: Path) -> None:
-    """Rename a file, in place of another. Windows refuses while a program reads the other: try again for a second."""
+    """Rename the file `source` to `target`, replacing a file of that name.
+
+    Windows refuses this while a program has `target` open, so it is tried for about a second.
+    """
     for pause in PAUSES:
         try:
             return os.replace(source, target)
@@ -92,7 +95,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def is_leftover(file: Path) -> bool:
-    """Tell by its name whether a file is a temporary one of `whole`."""
+    """Return True if a file's name is that of a temporary file that `whole` makes."""
     return _TEMPORARY.fullmatch(file.name) is not None
 
 
@@ -105,13 +108,16 @@ def _sync(path: Path, flags: int) -> None:
 
 
 def write_text(file: Path, text: str, durable: bool = True) -> None:
-    """Write a text file completely or not at all, by `whole`."""
+    """Write a UTF-8 text file completely or not at all. With `durable`, it outlives a power failure (see `whole`)."""
     with whole(file, durable) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def read_text(file: Path, again: str) -> str:
-    """Read a text file. Raises InputError if it is missing, not UTF-8 text, or larger than LARGEST. `again` ends the error's message."""
+    """Read a text file. Raises InputError if it is missing, not UTF-8 text, or larger than LARGEST bytes.
+
+    `again` is a sentence for the user at the end of the error's message, such as "Train again.".
+    """
     try:
         with open_file(file) as source:
             data = source.read(LARGEST + 1)
@@ -127,7 +133,7 @@ def read_text(file: Path, again: str) -> str:
 
 
 def open_file(file: str | os.PathLike) -> BufferedReader:
-    """Open an ordinary file to read its bytes.
+    """Open a regular file to read its bytes.
 
     Raises OSError if it cannot be read, or if it is a folder, a pipe, a socket or a device, which may have no end.
     """
@@ -143,9 +149,9 @@ def open_file(file: str | os.PathLike) -> BufferedReader:
 
 
 def check_file(file: str | os.PathLike) -> None:
-    """Raise OSError if a library must not open a path: it has to be an ordinary file, and not empty.
+    """Raise OSError unless a path leads to a regular file that is not empty. Call this before a library opens the path.
 
-    Linux's /proc has files that count as ordinary and empty, but may have no end.
+    Linux's /proc has regular files whose size is 0, but which may have no end.
     """
     facts = os.stat(file)
     _check_kind(facts, file)
@@ -159,7 +165,7 @@ def _check_kind(facts: os.stat_result, file: str | os.PathLike) -> None:
 
 
 def hash_file(file: Path, kind: Callable = hashlib.blake2b) -> "hashlib._Hash":
-    """Hash the content of a file. Returns hashlib's object, which can be updated further.
+    """Hash the content of a file with the hash function `kind`. Returns hashlib's object, which can be updated further.
 
     Raises OSError if the file cannot be read, or if it is a folder, a pipe or a device.
     """
@@ -220,7 +226,10 @@ def check_folder(folder: Path) -> None:
 
 
 def check_unicode(path: Path) -> None:
-    """Raise InputError if a path is not Unicode: most systems allow that, but JSON, TOML and HTML cannot name it."""
+    """Raise InputError if a path is not Unicode.
+
+    Most systems allow names of files that are not Unicode, but JSON, TOML and HTML cannot hold such a name.
+    """
     try:
         str(path.resolve()).encode()
     except UnicodeEncodeError:
@@ -228,13 +237,13 @@ def check_unicode(path: Path) -> None:
 
 
 def command_line(*words: object) -> str:
-    """Return a command for the user to type: words are quoted where the shell needs it."""
+    """Return a command that the user can type, with its words quoted where the shell needs it."""
     join = subprocess.list2cmdline if sys.platform == "win32" else shlex.join
     return join([str(word) for word in words])
 
 
 def clone_environment() -> dict[str, str]:
-    """Return the environment for a Python that is to import modules from its current folder, the root of the repository."""
+    """Return the environment variables for a Python process that imports modules from its current folder, the root of the repository."""
     return os.environ | {"PYTHONSAFEPATH": ""}
 
 

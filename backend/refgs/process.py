@@ -1,4 +1,4 @@
-"""Prepare what this process has from the system, such as its streams, and end it by a signal."""
+"""Check and prepare this process at its start: its standard streams, arguments and current folder. Also end it by a signal."""
 
 import errno
 import io
@@ -11,9 +11,10 @@ from refgs.errors import InputError
 
 
 class Output(io.RawIOBase):
-    """Write to the stream `raw`. What cannot be written is dropped, so that the work goes on: the disk of a log is full, a pipe is closed.
+    """Write to the stream `raw`, and drop what cannot be written, so that a full disk or a closed pipe does not stop the program.
 
-    `error` is the last error, None if there was none. A pipe that nobody reads any more is no error: `head` ends so.
+    `error` is the last error, None if there was none. A closed pipe is not recorded as an error, because programs such as `head` close it
+    early.
     """
 
     def __init__(self, raw: Any):
@@ -40,10 +41,10 @@ class Output(io.RawIOBase):
 
 
 def open_streams() -> Output:
-    """Make the standard streams safe to use. Returns the standard output's `Output`.
+    """Make the standard streams safe to use. Returns the `Output` that the standard output writes to.
 
-    A stream that was closed when the process started is opened as the null device: a file opened later would take its place, and get what
-    is printed. A path may hold characters that the terminal's encoding lacks: they are escaped.
+    A stream that was closed when the process started is opened as the null device. Otherwise a file that is opened later would get the
+    stream's number, and everything that is printed. Characters that the terminal's encoding lacks, as in a path, are escaped.
     """
     for number in range(3):
         try:
@@ -58,7 +59,7 @@ def open_streams() -> Output:
 
 
 def _dropping(stream: Any) -> tuple[io.TextIOWrapper, Output]:
-    """Replace a text stream by one that writes to an `Output`. Returns both."""
+    """Replace a text stream by one that drops what cannot be written. Returns the new stream, and the `Output` that it writes to."""
     encoding, lines = stream.encoding, stream.line_buffering or stream.write_through
     binary = stream.detach()
     output = Output(binary.detach() if isinstance(binary, io.BufferedWriter) else binary)
@@ -66,7 +67,7 @@ def _dropping(stream: Any) -> tuple[io.TextIOWrapper, Output]:
 
 
 def check_current_folder() -> None:
-    """Raise InputError if the current folder was deleted: many libraries ask for it."""
+    """Raise InputError if the current folder was deleted. Many libraries ask for its path, and fail without it."""
     try:
         os.getcwd()
     except OSError:
@@ -76,7 +77,10 @@ def check_current_folder() -> None:
 
 
 def check_arguments() -> None:
-    """Raise InputError if an argument is not Unicode, or if the system's settings hide that it is: libraries fail at such a name."""
+    """Raise InputError if a command-line argument is not Unicode, or cannot be decoded because the system's encoding is ASCII.
+
+    Many libraries cannot open a file with such a name.
+    """
     for word in sys.argv[1:]:
         try:
             word.encode()

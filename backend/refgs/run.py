@@ -120,7 +120,7 @@ def create_run(
     chosen: dict[str, str] | None = None,
     changed: dict[str, dict] | None = None,
 ) -> None:
-    """Create a run folder with cameras.json, capture.json, and run.toml, which comes last. Raise InputError if the folder is not free.
+    """Create a run folder with cameras.json and capture.json, and then run.toml. Raise InputError if the folder holds a run or other files.
 
     `settings` are the values in use. Two tables are written to run.toml for the user. `chosen` has the chosen value and the reason of each
     setting that was "auto". `changed` has the rows of changed settings (see `record_changes`).

@@ -28,7 +28,7 @@ _KEPT = (PHOTOS, "log.txt", LOCK, PROGRESS, STOP)  # does no harm to a new run
 def check_free(folder: Path) -> None:
     """Raise InputError if a new run cannot be created in a folder: it holds a run or other files, is a file, or its name is not Unicode.
 
-    A run is overlooked if its training was killed before its first checkpoint, because it has learned nothing.
+    A training that was killed before its first checkpoint has learned nothing. Its files do not count.
     """
     check_unicode(folder)
     if folder.exists() and not (folder.is_dir() and _nothing_learned(folder)):
@@ -50,7 +50,7 @@ def clear(folder: Path) -> None:
 
 
 def _nothing_learned(folder: Path) -> bool:
-    """Tell whether all that is in a folder was left by a training that was killed before its first checkpoint."""
+    """Return True if a folder holds nothing but files of a training that was killed before its first checkpoint."""
     own, checkpoints = {*_KEPT}, folder / CHECKPOINTS
     if checkpoints.is_dir():
         own |= {*_BEFORE}

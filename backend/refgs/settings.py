@@ -25,7 +25,7 @@ class _Section(BaseModel):
 class RegionSettings(_Section):
     """Box around the wanted part of a capture, and the result's up direction.
 
-    Both are in the frame of the cameras.json that a run without a region would write (docs/run-folder.md).
+    Both are in the coordinates that cameras.json has after a training without a region (docs/run-folder.md).
     """
 
     centre: Vector = Field(description="centre of the box")
@@ -46,7 +46,7 @@ class RegionSettings(_Section):
 
 
 class ImageSettings(_Section):
-    """Photos as they are trained on."""
+    """Preparation of the photos for the training."""
 
     max_side: int = Field(ge=16, le=8192, description="pixels on the longer side; larger photos are reduced to it")
     coarse: Literal["auto", "off"] = Field(
@@ -62,7 +62,7 @@ class ImageSettings(_Section):
 
 # Said as type checkers read it: `method_of` caches by these settings, so they must be known to be hashable.
 class RenderSettings(BaseModel, extra="forbid", frozen=True):
-    """Shading."""
+    """Shading: how material and light give a pixel's colour."""
 
     shading: Literal["deferred", "splat", "sh"] = Field(description="deferred: materials are blended, then shaded")
     diffuse: Literal["irradiance", "sh"] = Field(description="diffuse light: the environment's, or SH per surfel")
@@ -79,7 +79,7 @@ class RenderSettings(BaseModel, extra="forbid", frozen=True):
 
 
 class SurfelSettings(_Section):
-    """Surfels, and their values at the start."""
+    """Kind and number of surfels, and their values at the start of the training."""
 
     primitive: Literal["2dgs", "3dgs"] = Field(description="2dgs: flat discs")
     start: int = Field(ge=1, le=10_000_000, description="number of surfels at the start")
@@ -101,7 +101,7 @@ class SurfelSettings(_Section):
 
 
 class EnvironmentSettings(_Section):
-    """Learned light."""
+    """Learned light, a cubemap."""
 
     resolution: Literal[16, 32, 64, 128, 256] = Field(description="texels along each side of the cubemap's faces")
     radiance: float = Field(gt=0, le=1e6, description="radiance at the start")
@@ -127,7 +127,7 @@ class LightSettings(_Section):
 
 
 class CameraSettings(_Section):
-    """Cameras."""
+    """Refinement of the cameras' poses."""
 
     poses: Need = Field(
         description="refine the photos' poses; auto: only if features that photos share tell that they are not exact"
@@ -161,7 +161,7 @@ class IndirectSettings(_Section):
 
 
 class ResidualSettings(_Section):
-    """Residual: a view-dependent colour, sRGB-encoded, that adds what material and light do not explain. Left out under another light."""
+    """Residual: an sRGB-encoded colour by direction that adds what material and light do not explain. Left out under another light."""
 
     start: float = Field(
         gt=0, le=1, description="start, a part of the training; material and light are frozen from then on. 1: never"
@@ -219,7 +219,7 @@ class LossSettings(_Section):
 
 
 class NeedsSettings(_Section):
-    """Parts of the method that a scene may do without. `auto` measures whether it needs them; `on` keeps and `off` drops them."""
+    """Parts of the method that some scenes do without. `auto` measures whether the scene needs a part; `on` keeps and `off` drops it."""
 
     views: Need = Field(description="photos from the same place as another one")
     outside: Need = Field(description="pixels outside the mask, apart from a margin")
@@ -235,7 +235,7 @@ class NeedsSettings(_Section):
 
 
 class DensifySettings(_Section):
-    """Adding and removing surfels."""
+    """Adding and removing surfels during the training."""
 
     start: float = Field(ge=0, le=1, description="start, a part of the training")
     stop: float = Field(ge=0, le=1, description="part of the training after which surfels are only removed")
@@ -248,7 +248,7 @@ class DensifySettings(_Section):
 
 
 class PropagationSettings(_Section):
-    """Material-aware normal propagation (paper §3.3). At intervals, shiny metal surfels grow and so pass on their normals."""
+    """Material-aware normal propagation (Ref-Gaussian, §3.3). At intervals, shiny metal surfels grow and so pass on their normals."""
 
     every: int = Field(ge=0, description="iterations between passes; 0: none")
     stop: float = Field(ge=0, le=1, description="end, a part of the training")
@@ -260,7 +260,7 @@ class PropagationSettings(_Section):
 
 
 class MeshSettings(_Section):
-    """Exported mesh."""
+    """Size of the exported mesh and its textures."""
 
     resolution: int = Field(ge=16, le=1024, description="voxels along each side of the fused volume")
     triangles: int = Field(ge=100, le=10_000_000, description="number of triangles after simplification")
@@ -327,7 +327,7 @@ def load_settings(preset: str, changes: Iterable[str] = ()) -> Settings:
 
 
 def preset_settings(preset: str, changes: Iterable[Assignment]) -> Settings:
-    """Load a preset as `load_settings` does, and apply changes that were parsed before."""
+    """Load a preset as `load_settings` does, and apply changes that `parse_change` returned."""
     tables = _read_preset(preset)
     for change in changes:
         if not isinstance(tables.setdefault(change.section, {}), dict):
@@ -347,7 +347,10 @@ def parse_change(text: str) -> Assignment:
 
 
 def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
-    """Complete the settings recorded by a run. Keys that its release did not have yet get the standard preset's values."""
+    """Make `Settings` from the tables of settings that a run recorded. `source` names their file in error messages.
+
+    A key that is newer than the run's release gets the standard preset's value, or the value that works as that release did.
+    """
     # Before these keys existed, light was fixed to the world, there were no exposures and no residual, and nothing was left out.
     still = {"light": {"frame": "world", "exposure": "off"}, "residual": {"start": 1.0}}
     still |= {"cameras": {"poses": "off"}, "image": {"coarse": "off"}, "loss": {"prior": 0.0}}
@@ -356,7 +359,10 @@ def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
 
 
 def validate(tables: dict[str, Any], source: str) -> Settings:
-    """Make settings of nested tables. Raise InputError naming the first wrong key and what it may be."""
+    """Make `Settings` from tables, {section: {key: value}}. Raise InputError naming the first wrong key and what it may be.
+
+    `source` names the tables' file in the error's message.
+    """
     try:
         return Settings.model_validate(tables)
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""Register the operators and panels. They only call functions of the package `scene`."""
+"""Register the add-on's operators and panels. They leave the work to functions of other modules, mostly of the package `scene`."""
 
 import bpy
 

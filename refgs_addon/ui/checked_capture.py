@@ -1,4 +1,4 @@
-"""Draw the result of a capture's check in the Train panel: some photos, and a button that shows the cameras."""
+"""Draw a checked capture (a folder of photos) in the Train panel: some of its photos, and a button that shows its cameras."""
 
 from pathlib import Path
 from typing import ClassVar
@@ -36,9 +36,9 @@ class ShowCameras(OnJob, bpy.types.Operator):
 
 
 def draw_capture(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job) -> None:
-    """Draw the result of a capture's check: some photos, and a button that shows the cameras.
+    """Draw some photos of a checked capture, and a button that shows its cameras in the scene.
 
-    `job` is the job that made the check. Draws nothing if the job is of another kind or has not ended.
+    Draws nothing unless `job` has checked a capture (a folder of photos), as `jobs.check` and `jobs.make_masks` do.
     """
     checked = job.results.get("check", {})
     if "cameras" not in checked:

@@ -1,7 +1,8 @@
 """Ask before Blender closes whether running trainings continue or stop.
 
-Blender does not tell an add-on that it is about to close. So only the quit key and an entry in the File menu can ask. Blender can also be
-closed in other ways. Then a training continues only if its checkbox to keep it running is set.
+Blender does not tell an add-on that it is about to close. So the question comes only with the quit key, and with an entry that this module
+adds to the File menu. If Blender is closed in another way, a training continues only if the checkbox Keep Training when Blender Closes is
+set for it.
 """
 
 import sys
@@ -92,7 +93,7 @@ def quit_question() -> str:
 
 
 def draw_quit(self, context: bpy.types.Context) -> None:
-    """Draw an entry below Blender's own Quit while a training runs or waits."""
+    """Draw an entry in the File menu, below Blender's own Quit, that asks before it quits. Draws it only while a training runs or waits."""
     if jobs.trainings():
         self.layout.operator_context = "INVOKE_DEFAULT"
         self.layout.operator(Quit.bl_idname, text="Quit with Trainings Running…", icon="QUIT")

@@ -1,4 +1,7 @@
-"""Draw each decision of a training as a choice in the Train panel, with pictures of both answers."""
+"""Draw the decisions of a training in the Train panel, each as a choice with pictures of both answers.
+
+A decision says whether the training kept an optional part of the method, such as specular reflection.
+"""
 
 from pathlib import Path
 
@@ -20,7 +23,11 @@ PICTURE = 0.11  # lines of height for each letter of width: pictures fill a thir
 
 
 class _OnDecision(OnRunFolder):
-    """Store a run's folder, and in `need` which of its decisions an operator works on. Base class of these operators."""
+    """Store the decision that an operator works on. Base class of these operators.
+
+    `folder` is the run folder. `need` names the optional part of the method, such as specular reflection, that the training kept or
+    dropped.
+    """
 
     need: StringProperty(name="Need")
 
@@ -50,7 +57,10 @@ class TrainOtherWay(_OnDecision, bpy.types.Operator):
 
 
 def draw_decisions(box: bpy.types.UILayout, scene: bpy.types.Scene, folder: Path, width: int) -> None:
-    """Draw those decisions of a run that the artist has not confirmed yet. `width` is how many letters fit into a line."""
+    """Draw those decisions of a training that the artist has not confirmed yet, such as whether the object is glossy or matte.
+
+    `folder` is the run folder, and `width` is how many letters fit into a line.
+    """
     for decision in open_decisions(scene, folder):
         _draw(box.box(), folder, decision, width)
 

@@ -1,4 +1,7 @@
-"""Handle files that are dropped on the 3D view. A run.toml imports its run. A transforms.json makes its folder the capture to train."""
+"""Handle files that are dropped on the 3D view.
+
+A run.toml imports the run folder that it is in. A transforms.json makes its folder the capture to train on.
+"""
 
 from pathlib import Path
 

@@ -13,7 +13,10 @@ from .operators import ImportRun, OnRun, has_trainer
 
 
 class _Export(OnRun, ExportHelper):
-    """Ask for a file, and export the active run's splats, mesh or light to it, as `kind` says. Base class of the export operators."""
+    """Ask for a file, and export the active run to it. Base class of the export operators.
+
+    `kind` says what is exported, such as "splats", "mesh" or "light".
+    """
 
     bl_options: ClassVar = {"REGISTER"}
 

@@ -1,4 +1,4 @@
-"""Define the operator that tells the trainer what a part of a run is made of. A click in the 3D view chooses the part."""
+"""Define the operator that trains a run again with a hint: a part of the object's surface is metal, or is paint."""
 
 import bpy
 from bpy.props import EnumProperty, FloatVectorProperty
@@ -11,7 +11,11 @@ from .operators import OnRun, has_trainer
 
 
 class Hint(OnRun, bpy.types.Operator):
-    """Train again with a hint. If no part is chosen, wait until the artist clicks on a part."""
+    """Train the active run again with a hint: the material of a part of the object, metal or paint.
+
+    The part is what the artist has selected: splats in Edit Mode, or a box or ball around splats. If nothing is selected, wait for a click
+    on the part in the 3D view.
+    """
 
     bl_idname = "refgs.hint"
     bl_label = "This Part Is"
@@ -62,7 +66,11 @@ class Hint(OnRun, bpy.types.Operator):
 
 
 def clicked_ray(screen: bpy.types.Screen, x: int, y: int) -> tuple[Vector, Vector] | None:
-    """Return the ray through a pixel of the window, as origin and direction in world space. Returns None if no 3D view is there."""
+    """Return the ray through a pixel of a 3D view, as origin and direction in world space.
+
+    `x` and `y` count pixels from the lower left corner of the window. Returns None if the pixel is in no 3D view, or in its header or
+    sidebar.
+    """
     regions = [region for area in screen.areas if area.type == "VIEW_3D" for region in area.regions]
     there = [r for r in regions if r.x <= x < r.x + r.width and r.y <= y < r.y + r.height]
     if not there or any(region.type != "WINDOW" for region in there):  # the sidebar and the header lie over the view

@@ -1,4 +1,7 @@
-"""Make icons for the panels: a training's newest preview, its PSNR curve, and thumbnails of files."""
+"""Make icons for the panels: a training's newest preview, its PSNR curve, and thumbnails of files.
+
+Blender's layouts name an icon by its number, the argument `icon_value`.
+"""
 
 import math
 from pathlib import Path

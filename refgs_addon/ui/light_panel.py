@@ -142,7 +142,10 @@ CLASSES = (Relight, RecoveredLight, MatchLight, LightPanel)
 
 @bpy.app.handlers.persistent
 def _follow_world(scene: bpy.types.Scene, *_) -> None:
-    """Correct the diffuse light after the world was rotated or replaced, by hand or by an animation."""
+    """Update the diffuse light that imported runs have in Eevee, if the world was rotated or replaced.
+
+    Blender calls this after every change of the scene and of the frame.
+    """
     correct_diffuse(scene)
 
 

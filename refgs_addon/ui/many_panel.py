@@ -1,4 +1,7 @@
-"""Draw the panel Train Many, below Train: a folder of captures, and a table of their runs. Define its operators."""
+"""Draw the panel Train Many, below the panel Train, and define its operators.
+
+A batch is the training of all captures in a folder. The panel starts a batch, and shows a table with a row for each run.
+"""
 
 import time
 from pathlib import Path
@@ -75,7 +78,7 @@ class ChooseRun(ReportsErrors, bpy.types.Operator):
 
 
 class RunList(bpy.types.UIList):
-    """Draw the rows of a batch's table: a picture, the name, and below it how far the run is."""
+    """Draw a table's rows, one for each run of a batch (the training of many captures): a picture, the name, and below it the progress."""
 
     bl_idname = "REFGS_UL_runs"
 
@@ -129,7 +132,10 @@ class ManyPanel(Tab, bpy.types.Panel):
 
 
 def _draw_batch(box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
-    """Draw a batch that this Blender started. `width` is how many letters fit into a line."""
+    """Draw the progress and the buttons of a batch (the training of many captures) that this Blender started.
+
+    `width` is how many letters fit into a line.
+    """
     head = box.row()
     icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE"}.get(job.state, "SORTTIME")
     head.label(text=job.name, icon=icon)
@@ -150,7 +156,10 @@ def _draw_batch(box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
 
 
 def _draw_other_process(box: bpy.types.UILayout, context: bpy.types.Context, folder: Path) -> None:
-    """Draw the batch that another process, such as a terminal's, runs in a folder."""
+    """Draw the progress of a batch (the training of many captures) that another process runs, and a button that stops the batch.
+
+    `folder` is the folder of the batch's runs.
+    """
     states = [row.state for row in context.window_manager.refgs_rows] if batch_table.is_shown(folder) else []
     done, failed, stopping = states.count("done"), states.count("failed"), jobs.stop_requested(folder / jobs.LOGS)
     text = "Stopping" if stopping else count_words(done, len(states), failed) if states else "Starting"
@@ -161,7 +170,10 @@ def _draw_other_process(box: bpy.types.UILayout, context: bpy.types.Context, fol
 
 
 def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, folder: Path, width: int) -> None:
-    """Draw the table, and below it the line on the selected run and its buttons."""
+    """Draw the table of the runs in `folder`, and below it the selected run's error, or a button that imports this run.
+
+    A last button makes all finished runs assets. `width` is how many letters fit into a line.
+    """
     manager = context.window_manager
     layout.template_list(RunList.bl_idname, "", manager, "refgs_rows", manager, "refgs_row", rows=ROWS)
     row = batch_table.chosen_row(folder)
@@ -177,7 +189,10 @@ def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, folder: 
 
 
 def _draw_library(box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
-    """Draw the job that turns runs into assets for the asset browser."""
+    """Draw the progress or the result of a job that turns runs into assets for the asset browser.
+
+    `width` is how many letters fit into a line.
+    """
     row = box.row()
     row.label(text=job.name, icon={"done": "CHECKMARK", "failed": "ERROR"}.get(job.state, "SORTTIME"))
     row.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).serial = job.serial

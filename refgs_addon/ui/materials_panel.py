@@ -65,7 +65,10 @@ class AddEdit(OnRun, bpy.types.Operator):
 
 
 class _OfEdit(ReportsErrors):
-    """Base class of operators that work on an edit: a modifier of the splats that changes their materials. It stores which one."""
+    """Store the edit that an operator works on. Base class of these operators.
+
+    An edit is a modifier that changes the materials of splats. `splats` is the name of their object, and `edit` the name of the modifier.
+    """
 
     splats: StringProperty(name="Splats", options={"HIDDEN"})
     edit: StringProperty(name="Edit", options={"HIDDEN"})
@@ -86,7 +89,7 @@ class RemoveEdit(_OfEdit, bpy.types.Operator):
 class SetMaterial(_OfEdit, bpy.types.Operator):
     """Set the values of an edit to those of a material preset.
 
-    Blender's own operator does the same, but its changes cannot be undone.
+    Blender's own operator for presets does the same, but its changes cannot be undone.
     """
 
     bl_idname = "refgs.set_material"
@@ -102,8 +105,8 @@ class SetMaterial(_OfEdit, bpy.types.Operator):
 class KeepMaterial(_OfEdit, bpy.types.Operator):
     """Save the values of an edit as a material preset, or remove a preset. Its buttons are + and − beside the list of presets.
 
-    Blender's own operator cannot do this, because it does not read the inputs of a modifier. In Blender 4.3 it also overwrites a preset of
-    the same name.
+    Blender's own operator for presets cannot do this, because it does not read the inputs of a modifier. In Blender 4.3 it also overwrites
+    a preset of the same name.
     """
 
     bl_idname = "refgs.keep_material"

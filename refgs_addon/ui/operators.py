@@ -45,7 +45,7 @@ class ReportsErrors:
 class OnJob(ReportsErrors):
     """Give an operator the job that its button was drawn for. Base class of the operators on one job.
 
-    The job is found by its serial: its place in the list changes when another job is dismissed.
+    The job is found by its serial number, because its place in the list changes when another job is dismissed.
     """
 
     bl_options: ClassVar = {"REGISTER"}
@@ -180,7 +180,7 @@ class Crop(ReportsErrors, bpy.types.Operator):
 
 
 class _Deletes(ReportsErrors):
-    """Find the splats that an operator deletes or restores, and go back to Object Mode. Base class."""
+    """Give an operator the splats to delete from, or to restore, and go back to Object Mode. Base class of these operators."""
 
     splats: StringProperty(name="Splats", description="The object")
 
@@ -214,7 +214,7 @@ class RestoreSplats(_Deletes, bpy.types.Operator):
 
 
 def show_materials(context: bpy.types.Context) -> None:
-    """Change all 3D views that show no materials, those in Solid or Wireframe mode, to Material Preview under the scene's light."""
+    """Switch the 3D views that are in Solid or Wireframe mode to Material Preview, lit by the scene's world."""
     for area in context.screen.areas if context.screen else ():
         if area.type == "VIEW_3D":
             shading = area.spaces.active.shading
@@ -299,7 +299,10 @@ class MarkAsset(OnRun, bpy.types.Operator):
 
 
 class _Render(ReportsErrors, ExportHelper):
-    """Render in another Blender process. If Blender has no window, render in this process. Base class of the operators that render."""
+    """Ask for a PNG file to render to. Base class of the operators that render.
+
+    They render in another Blender process, or in this one if it has no window. Their buttons are disabled while the scene has no camera.
+    """
 
     bl_options: ClassVar = {"REGISTER"}
     filename_ext = ".png"

@@ -116,7 +116,10 @@ class ChooseBrush(ReportsErrors, bpy.types.Operator):
 
 
 def choose_brush(settings: bpy.types.ToolSettings, paints: str) -> None:
-    """Set up the brush for images: to paint the "object" white, to paint the "rest" black, or to erase strokes ("nothing")."""
+    """Set up the brush that paints on images, for the strokes that correct a mask.
+
+    `paints` is "object" (white strokes), "rest" (black strokes, on what is not the object) or "nothing" (erase strokes).
+    """
     colors = compat.paint_colors(settings)
     colors.use_unified_color = True
     colors.color, colors.secondary_color = ((0.0,) * 3, (1.0,) * 3) if paints == "rest" else ((1.0,) * 3, (0.0,) * 3)
@@ -127,7 +130,10 @@ def choose_brush(settings: bpy.types.ToolSettings, paints: str) -> None:
 
 
 def show_in_editor(context: bpy.types.Context, canvas: bpy.types.Image) -> None:
-    """Show a canvas in an image editor, ready to paint: in one that is open, otherwise in a new window."""
+    """Show a canvas, the image on which strokes are painted, in an image editor in paint mode.
+
+    Opens a new window if there is no image editor. Does nothing if Blender has no window.
+    """
     if bpy.app.background:
         return
     manager = context.window_manager

@@ -189,7 +189,7 @@ class TrainPanel(Tab, bpy.types.Panel):
 
 
 def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job, width: int) -> None:
-    """Draw a job of the trainer: its progress, what it found, and its buttons. `width` is how many letters fit into a line."""
+    """Draw a job of the trainer: its progress, its results and its buttons. `width` is how many letters fit into a line."""
     head = box.row()
     icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE", "paused": "PAUSE"}.get(job.state, "SORTTIME")
     head.label(text=job.name, icon=icon)
@@ -248,7 +248,7 @@ def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job, wid
 
 
 def _draw_photos(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job, width: int) -> None:
-    """Draw how many photos or masks a job has made, and where they are."""
+    """Draw how many photos or masks a job has made, and the path of their folder. `width` is how many letters fit into a line."""
     if found := job.results.get("frames"):
         out = f"{found['blurred']} were blurred, {found['duplicates']} showed what the one before did"
         wrapped_text(box, f"{found['photos']} photos of {found['frames']} frames; {out}", width)
@@ -314,9 +314,10 @@ def command_button(layout: bpy.types.UILayout, job: jobs.Job, command: str, *, t
 
 
 def _draw_run(box: bpy.types.UILayout, scene: bpy.types.Scene, folder: Path, width: int) -> None:
-    """Draw a run of the scene's list: a button that imports or resumes it, or the progress of its training; then its decisions.
+    """Draw a run of the scene's list, and below it the decisions of its training that the artist has not confirmed yet.
 
-    `width` is how many letters fit into a line.
+    A finished run has a button that imports it, and a stopped one a button that resumes it. For a run that another process trains, the
+    progress is drawn. `width` is how many letters fit into a line.
     """
     state = jobs.run_state(folder)
     row = box.row(align=True)

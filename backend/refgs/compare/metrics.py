@@ -147,9 +147,9 @@ def normal_ssim(normals: np.ndarray, reference: np.ndarray, alpha: np.ndarray, r
 
 
 def channel_products(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Compute three means for each colour channel, over the pixels in `mask` (h, w): of image², image · reference and reference².
+    """Compute three means for each colour channel over the pixels in `mask` (h, w). `aligned_psnr` needs them from every view.
 
-    Returns (3, channels), one row for each mean. `aligned_psnr` needs them from every view.
+    They are the means of image², image · reference and reference². Returns (3, channels), one row for each mean.
     """
     a, b = image[mask].astype(np.float64), reference[mask].astype(np.float64)
     return np.stack([(a * a).mean(0), (a * b).mean(0), (b * b).mean(0)])
@@ -218,11 +218,12 @@ def _elevations(height: int) -> np.ndarray:
 def environment_log_rmse(environment: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
     """Compute the RMS error of a recovered panorama's log radiance, after a correction of its brightness.
 
-    The correction is one factor. It is chosen such that the mean difference of the logarithms is zero. Returns the error and the factor.
+    The correction is one factor on the recovered panorama, `environment`. It is chosen such that the mean difference of the logarithms is
+    zero. Returns the error and the factor.
 
     Both panoramas are equirectangular (h, w, 3) and linear. The larger one is averaged down to the size of the smaller one. Pixels are
-    weighted by solid angle. The logarithm is natural: an error of 0.1 is about 10 %. A thousandth of a panorama's mean radiance is added to
-    it before the logarithm. So differences between almost black pixels hardly count.
+    weighted by solid angle. The logarithm is natural: an error of 0.1 is about 10 %. Before the logarithm, a thousandth of a panorama's
+    mean radiance is added to its pixels. So differences between almost black pixels hardly count.
     """
     a, b = (resized(x, min(len(environment), len(reference))) for x in (environment, reference))
     weight = np.cos(_elevations(len(a)))

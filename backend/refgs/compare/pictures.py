@@ -16,7 +16,7 @@ TOLD, DOUBTFUL = (0.33, 0.35, 0.38), (1.0, 0.6, 0.15)  # sRGB: where photos tell
 
 
 def composite(view: LoadedView, background: Tensor) -> Tensor:
-    """Composite a photo over a background colour (3,). Return sRGB-encoded floats (H, W, 3) in 0..1.
+    """Composite a photo over a background colour (3,), both sRGB-encoded. Return floats (H, W, 3) in 0..1.
 
     Values brighter than white are clipped. A photo without alpha is only clipped.
     """
@@ -51,7 +51,10 @@ def color_picture(rendering: Rendering, background: np.ndarray) -> np.ndarray:
 
 
 def picture(name: str, value: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Convert one pass of a rendering to an 8-bit RGB or grey picture. `maps` returns the names and values.
+    """Convert one map of a rendering to an 8-bit RGB or grey picture.
+
+    `name` and `value` are an entry of the dictionary that `maps` returns. They may also be "doubt" and a map (H, W) in 0..1 of how little
+    the photos tell metal from paint.
 
     - color: composited over white
     - albedo: sRGB-encoded

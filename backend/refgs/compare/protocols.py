@@ -16,9 +16,10 @@ MOST_RADIANCE = 4.0  # Stanford-ORB clips radiance here for PSNR-H
 
 
 def albedo_ratio(pairs: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Compute TensoIR's correction of base colour (3,): the median of true divided by rendered values, over all pixels given.
+    """Compute TensoIR's correction of base colour: a factor for each channel (3,), the median of true divided by rendered values.
 
-    `pairs` are rendered and true linear base colours (N, 3) of the object's pixels, one pair for each view.
+    `pairs` has a pair for each view: the rendered and the true linear base colours (N, 3) of the object's pixels. The median is over the
+    pixels of all views.
     """
     rendered, true = (np.concatenate(part) for part in zip(*pairs, strict=True))
     return np.median(true / np.maximum(rendered, 1e-6), axis=0)
@@ -66,8 +67,8 @@ def similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray, scaled: b
       Stanford-ORB's program
 
     Both pictures are black outside the eroded mask, and means include this black. If `scaled`, each channel of the rendering is first
-    multiplied by its least-squares factor, as for pictures under another light. A PSNR below that of a uniform grey of 0.5 is replaced by
-    the grey's.
+    multiplied by its least-squares factor, which Stanford-ORB does for pictures under another light. A PSNR below that of a uniform grey of
+    0.5 is replaced by the grey's.
     """
     inside = eroded(mask > 0.5)[..., None]
     image, photo = (np.where(inside, np.maximum(x, 0), 0).astype(np.float64) for x in (image, photo))
@@ -101,7 +102,10 @@ def _small_ssim(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def cosine_distance(normals: np.ndarray, true: np.ndarray, mask: np.ndarray) -> float:
-    """Compute Stanford-ORB's error of normals (h, w, 3): the mean of 1 − cosine over the eroded mask. A missing normal counts as 1."""
+    """Compute Stanford-ORB's error of normals (h, w, 3): the mean of 1 − cosine over the eroded mask (see `eroded`).
+
+    A pixel where a normal has length 0 has the error 1. If the eroded mask is empty, the result is 0.
+    """
     seen = eroded(mask > 0.5)
     a, b = (x[seen] / (np.linalg.norm(x[seen], axis=-1, keepdims=True) + 1e-6) for x in (normals, true))
     return float((1 - (a * b).sum(-1)).mean(dtype=np.float64)) if seen.any() else 0.0
@@ -110,7 +114,8 @@ def cosine_distance(normals: np.ndarray, true: np.ndarray, mask: np.ndarray) -> 
 def depth_error(views: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> float:
     """Compute Stanford-ORB's scale-invariant error of depth: the mean squared error after one least-squares factor for all views.
 
-    `views` has rendered depth, true depth and mask (h, w) of each view. Only the eroded masks are compared; the mean is over all pixels.
+    `views` has rendered depth, true depth and mask (h, w) of each view. The mean is over all pixels of the picture, but outside the eroded
+    mask (see `eroded`) the error is 0.
     """
     rows = [
         (a * seen, b * seen) for a, b, seen in ((a.astype(np.float64), b, eroded(mask > 0.5)) for a, b, mask in views)

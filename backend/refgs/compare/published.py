@@ -1,6 +1,6 @@
-"""Read the ground truth of published data sets, TensoIR-Synthetic and Stanford-ORB, as `refgs.compare.truth` reads that of other captures.
+"""Read the ground truth of two published data sets, TensoIR-Synthetic and Stanford-ORB. `refgs.compare.truth` reads other ground truth.
 
-`refgs.capture.tensoir` and `refgs.capture.stanford_orb` name the sources of the layouts.
+`refgs.capture.tensoir` and `refgs.capture.stanford_orb` describe the files, and name the sources of these descriptions.
 """
 
 from dataclasses import replace
@@ -57,7 +57,10 @@ class TensoIRTruth(GroundTruth):
         return cv2.resize(linear, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
     def _pixels(self, name: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Read a picture of a view as float32 in 0..1, and its alpha, 1 if it has none."""
+        """Read the picture `name`.png of the camera's view. Return its pixels (H, W, 3) and its alpha (H, W), as float32 in 0..1.
+
+        Alpha is 1 if the file has none. The picture keeps its size. Raises InputError if it does not fit the view (see `check_size`).
+        """
         file = self.folder / camera.name / f"{name}.png"
         pixels, alpha = read_image(file, is_data=True)
         check_size(file, pixels, camera)
@@ -68,7 +71,7 @@ class TensoIRTruth(GroundTruth):
 class StanfordORBTruth(GroundTruth):
     """Read the true normals, depths and base colour of a scene of Stanford-ORB, and photos of its object under the lights of other scenes.
 
-    `folder` is the scene's folder. There are true maps for its test photos. Their files hold normals in OpenGL's camera axes
+    `folder` is the scene's folder. Its test photos have true maps. The files of these maps hold normals in OpenGL's camera axes
     (`scripts/preprocess/mesh_to_depth.py` in Stanford-ORB's repository), and base colour sRGB-encoded (`orb/utils/test.py`).
     """
 
@@ -105,12 +108,15 @@ class StanfordORBTruth(GroundTruth):
         return cv2.resize(depth.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
     def novel_views(self) -> list[View]:
-        """Return the photos of the object in other scenes whose lights are known. Their cameras are in the training's coordinates."""
+        """Return the views that show the same object in other scenes. Scenes without a file of their light are left out.
+
+        The views' cameras are in the training's coordinates.
+        """
         found = [view for scene, view in novel_views(self.folder) if (self._truths / scene / "env_map").is_dir()]
         return [replace(view, camera=in_frame(view.camera, self._to_run)) for view in found]
 
     def light(self, view: View) -> np.ndarray:
-        """Read the light of a photo. Return a panorama (H, W, 3), rotated to the coordinates of the training.
+        """Read the light under which a view's photo was taken. Return a panorama (H, W, 3), rotated to the coordinates of the training.
 
         The file is in the camera's coordinates. Its middle is the direction in which the camera looks, and its right and top are the
         camera's. This is the convention of `env_map_to_cam_to_world_by_convention` in `orb/utils/env_map.py` of Stanford-ORB's repository.
@@ -142,7 +148,7 @@ def truth_folder(folder: Path) -> Path:
 
 
 def _load(file: Path, channels: int) -> np.ndarray:
-    """Load an array (H, W) or (H, W, channels) of NumPy. Raises InputError naming the file."""
+    """Load an array from a .npy file: (H, W) if `channels` is 1, otherwise (H, W, channels). Raises InputError naming the file."""
     try:
         pixels = read_array(file, "Download the data set again.")
     except FileNotFoundError:

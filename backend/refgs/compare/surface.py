@@ -52,7 +52,8 @@ def seen(mesh: Mesh, points: np.ndarray, cameras: list[Camera], offset: float) -
 
     A camera sees a point if the point is in its picture, and if the mesh does not hide it.
 
-    Rays run from the points to the cameras. They start at the distance `offset` from the point, so that they do not hit the surface there.
+    Rays run from the points to the cameras. Each ray starts at the distance `offset` from its point, so that it does not hit the surface
+    there.
     """
     middle = mesh.vertices.mean(axis=0)  # Embree traces in float32: centre the mesh
     scene = EmbreeScene()

@@ -26,7 +26,8 @@ class GroundTruth:
     - light.exr: the light, as a panorama
     - mesh.ply: the mesh
     - normal/VIEW.exr: the normals of the view named VIEW. The folders of the other maps have the names in PASSES.
-    - alpha/VIEW.exr: the object's alpha in this view
+    - alpha/VIEW.exr: the object's alpha in this view; views with maps must have it
+    - color/VIEW.exr: the view under the photos' light
     - relight/HDRI.exr: another light, named HDRI
     - relight/HDRI/VIEW.exr: the view under this light
 
@@ -43,7 +44,7 @@ class GroundTruth:
         self._find()
 
     def _find(self) -> None:
-        """Find what is in the folder. Raises InputError if there is nothing."""
+        """Find which maps, lights and mesh the folder has. Raises InputError if it has none of them."""
         self.passes = [name for name in PASSES if (self.folder / name).is_dir()]
         relit = (self.folder / "relight").iterdir() if (self.folder / "relight").is_dir() else ()
         self.hdris = sorted({file.stem for file in relit if file.is_dir() or file.suffix == ".exr"})
@@ -87,9 +88,9 @@ class GroundTruth:
         return pixels[..., :3]
 
     def panorama(self, name: str) -> np.ndarray:
-        """Read the light in the file NAME.exr. Return a panorama (H, W, 3), rotated to the coordinates of the training.
+        """Read the light in the file `name`.exr; `name` is "light" or "relight/HDRI". Return a panorama (H, W, 3) of linear radiance.
 
-        The panorama is equirectangular, in Blender's orientation.
+        The panorama is equirectangular, in Blender's orientation, and rotated to the coordinates of the training.
         """
         panorama = read_environment(self._light_file(name))
         return sample(panorama, directions(*panorama.shape[:2]) @ self._turn.astype(np.float32))
@@ -109,7 +110,10 @@ class GroundTruth:
         return self._picture(f"relight/{hdri}", camera)
 
     def color(self, camera: Camera) -> np.ndarray:
-        """Read the true picture of the camera's view under the photos' light, as `relit` does."""
+        """Read the true picture of the camera's view under the photos' light, as premultiplied linear RGBA (h, w, 4).
+
+        A larger picture is reduced.
+        """
         return self._picture("color", camera)
 
     def _picture(self, folder: str, camera: Camera) -> np.ndarray:
