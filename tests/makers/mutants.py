@@ -5,6 +5,7 @@ import json
 import math
 import os
 import random
+import re
 import stat
 import struct
 import tomllib
@@ -165,6 +166,7 @@ def damage_folder(folder: Path, dice: random.Random) -> None:
     """Damage a capture as people and programs do: in what its files are and say, not in their bytes."""
     for _ in range(dice.choice((1, 1, 1, 2, 3))):
         files = sorted(file for file in folder.rglob("*") if file.is_file() and not file.is_symlink())
+        files = [file for file in files if file.stat().st_size < HOLE]
         if not files:
             return
         file, other = dice.choice(files), dice.choice(files)
@@ -187,7 +189,7 @@ def damage_folder(folder: Path, dice: random.Random) -> None:
                 ).write_bytes(b"\0" * 99)
             case 5:
                 with open(file, "r+b") as opened:
-                    opened.truncate(dice.choice((0, 1, 20 << 30)))  # without taking room on the disk
+                    opened.truncate(dice.choice((0, 1, HOLE)))  # without taking room on the disk
             case _ if file.suffix in (".png", ".jpg", ".exr"):
                 _other_picture(dice).save(file.with_suffix(".png"))
             case _ if file.suffix == ".npy":
@@ -195,8 +197,21 @@ def damage_folder(folder: Path, dice: random.Random) -> None:
             case _ if file.suffix == ".json":
                 with suppress(ValueError):  # another file's content is in it
                     file.write_text(json.dumps(_other_poses(json.loads(file.read_text()), dice)))
+            case _ if file.suffix == ".txt":
+                words = re.split(r"(\s+)", file.read_text())
+                numbers = [i for i, word in enumerate(words) if re.fullmatch(r"-?\d.*", word)]
+                for i in dice.sample(numbers, min(len(numbers), dice.choice((1, 1, 9)))):
+                    words[i] = str(dice.choice(EXTREMES))
+                file.write_text("".join(words))
+            case _ if file.suffix == ".bin":
+                content = bytearray(file.read_bytes())
+                at = dice.randrange(max(1, len(content) - 7))
+                content[at : at + 8] = struct.pack("<d", dice.choice(EXTREMES))
+                file.write_bytes(content)
 
 
+HOLE = 20 << 30  # bytes of a file that takes no room on the disk: more than is read of any
+EXTREMES = (0, -1, 1e-320, 1e-30, 1e30, 1e308, math.nan, math.inf)
 _SHAPES = [(), (0,), (0, 0, 3), (3,), (4, 4), (5, 7, 3), (5, 7, 4), (2, 5, 7, 3), (1, 1), (100_000, 1, 3)]
 
 
@@ -208,7 +223,7 @@ def _other_picture(dice: random.Random) -> Image.Image:
 
 def _other_poses(value: Any, dice: random.Random) -> Any:
     """Change all numbers, or all poses, in what `json.loads` returns in one way."""
-    factor, axes = dice.choice((0, -1, 1e-320, 1e-30, 1e30, 1e308, math.nan, math.inf)), dice.sample(range(4), 4)
+    factor, axes = dice.choice(EXTREMES), dice.sample(range(4), 4)
     way = dice.randrange(5)
 
     def changed(value: Any) -> Any:

@@ -334,6 +334,7 @@ READERS: dict[str, Reader] = {
     "a capture with masks and normals": _folder(_with_masks_and_normals),
     "a capture by NeRF-Blender": _folder(captures.nerf_blender, {"train": 5, "test": 2}),
     "a capture by COLMAP, all files": _folder(captures.colmap, count=6),
+    "a capture by COLMAP, all files as text": _folder(captures.colmap, False, count=6),
     "a capture of NeRO": _folder(captures.nero, 6),
     "a capture of TensoIR": _folder(captures.tensoir, {"train": 5, "test": 1}, 16),
     "nerfstudio's transforms.json": Reader(
