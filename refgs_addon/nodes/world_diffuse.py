@@ -91,8 +91,9 @@ def _switch_off_elsewhere(value: bpy.types.NodeSocket) -> None:
 
 
 def set_harmonics(tree: bpy.types.ShaderNodeTree, harmonics: Sequence[Sequence[float]], window: float) -> None:
-    """Set the world's light. `harmonics` are nine coefficients (9, 3) of its irradiance over π, in linear Rec.709.
+    """Set the world's light. `harmonics` are nine coefficients (9, 3) of its irradiance over π, in Blender's working space.
 
+    Eevee works in that space, too. The group divides and limits each channel, so its result depends on the space.
     Their order is 1; x, y, z; xy, yz, 3z² − 1, xz, x² − y². This function multiplies them by the harmonics' constants, BANDS and THIRD.
     `window` is the factor by which Eevee weakens the second band.
     """
