@@ -6,16 +6,18 @@ Doubt is 0 where the photos show whether the surface is metal or paint, and 1 wh
 import bpy
 
 from ..compat import node_tree
+from ..scene.color_spaces import from_rec709
 from . import add, add_input, modifier_tree, out
 
 NAME = "RefGS Doubt"  # the mesh's tree and modifier
-# Linear colours where photos tell, and where they do not: those of the report's pictures, backend/refgs/compare/pictures.py.
+# Linear Rec.709 colours where photos tell, and where they do not: those of the report's pictures, backend/refgs/compare/pictures.py.
 TOLD, DOUBTFUL = (0.089, 0.1, 0.119, 1.0), (1.0, 0.319, 0.02, 1.0)
 
 
 def doubt_color(tree: bpy.types.NodeTree, doubt: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
     """Add a node that turns doubt into a colour: TOLD for 0, DOUBTFUL for 1. Returns its output."""
-    return out(add(tree, "ShaderNodeMix", {"Factor": doubt, "A": TOLD, "B": DOUBTFUL}, data_type="RGBA"))
+    colors = {"A": from_rec709(TOLD), "B": from_rec709(DOUBTFUL)}
+    return out(add(tree, "ShaderNodeMix", {"Factor": doubt, **colors}, data_type="RGBA"))
 
 
 def doubt_material(name: str, texture: bpy.types.Image) -> bpy.types.Material:

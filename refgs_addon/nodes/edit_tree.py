@@ -6,6 +6,7 @@ from the photos.
 
 import bpy
 
+from ..scene.color_spaces import from_rec709
 from . import (
     add,
     add_input,
@@ -50,7 +51,7 @@ def edit_tree() -> bpy.types.NodeTree:
     add_input(tree, "Where", "Menu", f"Which splats to edit: {which}")
     add_input(tree, "Region", "Object", "Object that marks the region: move, rotate and scale it")
     add_input(tree, "Painted", "String", "Painted vertex group of the region")
-    add_input(tree, "Base Color", "Color", "New base colour", default_value=(1.0, 0.77, 0.34, 1.0))
+    add_input(tree, "Base Color", "Color", "New base colour", default_value=from_rec709((1.0, 0.77, 0.34, 1.0)))
     for name, value, description in (
         ("Falloff", 0.2, "Width of the soft border, as a fraction of the region"),
         ("Tolerance", 0.2, "Largest difference from the material at the region that is still edited"),
@@ -113,7 +114,7 @@ def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.N
     ball = vector_math(tree, "LENGTH", inside)
     where = {"Geometry": group["Geometry"], "Sample Position": region.outputs["Location"]}
     nearest = add(tree, "GeometryNodeSampleNearest", where)
-    squares = []
+    squares = []  # of distances in the working space: in ACEScg, hues differ less than in linear Rec.709
     for name, kind in (("base_color", "FLOAT_VECTOR"), ("metallic", "FLOAT"), ("roughness", "FLOAT")):
         value = read_attribute(tree, name, kind)
         sample = {"Geometry": group["Geometry"], "Value": value, "Index": out(nearest)}

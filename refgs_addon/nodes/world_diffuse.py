@@ -94,8 +94,9 @@ def _switch_off_elsewhere(value: bpy.types.NodeSocket) -> None:
 
 
 def set_harmonics(tree: bpy.types.ShaderNodeTree, harmonics: Sequence[Sequence[float]], window: float) -> None:
-    """Set the world's light in the node group `tree`. `harmonics` are nine coefficients (9, 3) of the irradiance over π, in linear Rec.709.
+    """Set the world's light in the node group `tree`. `harmonics` are nine coefficients (9, 3) of the irradiance over π.
 
+    They are in Blender's working space, because Eevee works in that space, too, and the group divides and limits each channel.
     Their order is 1; x, y, z; xy, yz, 3z² − 1, xz, x² − y². This function multiplies them by the harmonics' constants, BANDS and THIRD.
     `window` is the factor by which Eevee weakens the second band: x, y, z.
     """

@@ -1,6 +1,16 @@
-"""Choose colour spaces by lists of their possible names, because each OpenColorIO config names them differently."""
+"""Choose colour spaces by lists of their possible names, because each OpenColorIO config names them differently.
+
+Blender converts pictures to its working space, which a config, or from Blender 5 the file, may choose. It takes the colours that a script
+gives to attributes and nodes as they are. RefGS's are linear Rec.709, so they pass through `from_rec709` and `to_rec709`.
+"""
+
+from typing import TYPE_CHECKING
 
 import bpy
+from mathutils import Color, Matrix, Vector
+
+if TYPE_CHECKING:
+    import numpy as np
 
 # Names of a space in Blender's configs, in those of ACES 1.3 and 2, in those of ACES 1.0 and 1.2, and in others.
 SRGB = (
@@ -36,6 +46,56 @@ _VIEWS = ("Standard", "Un-tone-mapped")
 def set_color_space(image: bpy.types.Image, names: tuple[str, ...]) -> bool:
     """Set an image's colour space to the first of `names` that the OpenColorIO config has. If there is none, return False."""
     return _set_first(image.colorspace_settings, "name", names)
+
+
+def from_rec709(colors: "np.ndarray | tuple[float, ...]") -> "np.ndarray | tuple[float, ...]":
+    """Convert linear Rec.709 colours to Blender's working space.
+
+    `colors` is an array (..., 3) or (..., 4), or a tuple of three or four numbers; so is the result. Alpha stays. If the working space is
+    linear Rec.709, `colors` itself is returned.
+    """
+    return _convert(colors, _working_space())
+
+
+def to_rec709(colors: "np.ndarray | tuple[float, ...]") -> "np.ndarray | tuple[float, ...]":
+    """Convert colours of Blender's working space to linear Rec.709: the inverse of `from_rec709`.
+
+    Colours that Rec.709 cannot show have components below 0 or above 1.
+    """
+    return _convert(colors, _working_space().inverted())
+
+
+def _convert(colors: "np.ndarray | tuple[float, ...]", matrix: Matrix) -> "np.ndarray | tuple[float, ...]":
+    # Blender's own matrix from linear Rec.709 to itself is not quite the identity: up to 1e-5 off in 4.5.
+    if max(abs(x) for row in matrix - Matrix.Identity(3) for x in row) < 1e-4:
+        return colors
+    if isinstance(colors, tuple):
+        return (*(matrix @ Vector(colors[:3])), *colors[3:])
+    import numpy as np  # Debian's Blender may lack it
+
+    result = colors.copy()
+    result[..., :3] = result[..., :3] @ np.array(matrix).T
+    return result
+
+
+def _working_space() -> Matrix:
+    """Find the matrix from linear Rec.709 to Blender's working space.
+
+    Blender converts the primaries as it converts pictures, so that splats agree with textures. Its functions for single colours know the
+    working space only by the config's interchange roles. Configs of ACES 1.0 to 1.2 have none, and the functions then change nothing.
+    They serve where no name of linear Rec.709 is known.
+    """
+    image = bpy.data.images.new("primaries", 3, 1, float_buffer=True, is_data=True)
+    try:
+        image.pixels = 1, 0, 0, 1, 0, 1, 0, 1, 0, 0, 1, 1
+        image.pack()  # a new colour space then holds for these pixels
+        if set_color_space(image, LINEAR_REC709):
+            primaries = [image.pixels[start : start + 3] for start in (0, 4, 8)]
+        else:
+            primaries = [Color(primary).from_rec709_linear_to_scene_linear() for primary in Matrix.Identity(3)]
+    finally:
+        bpy.data.images.remove(image)
+    return Matrix(primaries).transposed()
 
 
 def set_srgb_view(scene: bpy.types.Scene) -> None:

@@ -14,6 +14,7 @@ from ..nodes.kept_tree import ROW
 from ..nodes.splats_tree import NAME as SPLATS
 from ..ply_file import PLY_TYPES, read_rows
 from .atomic_file import atomic_write
+from .color_spaces import to_rec709
 from .edit import edits, is_edited, splats_of
 from .mesh_exchange import TEXTURES, write_mesh
 from .run_parts import FOLDER
@@ -41,6 +42,9 @@ def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
             values = np.empty(width * len(cloud.points), np.float32)
             cloud.attributes[name].data.foreach_get(field, values)
             found[name] = values.reshape(-1, 4)[:, :3] if width == 4 else values
+        color = to_rec709(found["base_color"])
+        if color is not found["base_color"]:  # the working space may have colours that Rec.709 cannot show
+            found["base_color"] = color.clip(0, 1)
         found[ROW] = np.arange(len(cloud.points), dtype=np.int32)
         if ROW in cloud.attributes:
             cloud.attributes[ROW].data.foreach_get("value", found[ROW])

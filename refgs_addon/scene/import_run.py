@@ -8,12 +8,13 @@ from mathutils import Matrix
 
 from ..errors import InputError
 from ..json_file import read_json
+from ..nodes import principled
 from ..nodes.world_diffuse import add_world_diffuse
 from ..ordinary import check_gltf
 from . import run_parts
 from .camera_objects import add_camera, frame_camera, light_of, read_cameras
 from .capture_cameras import replace_cameras
-from .color_spaces import LINEAR_REC709, set_color_space
+from .color_spaces import LINEAR_REC709, SRGB, set_color_space
 from .place_run import extent
 from .run_toml import capture_of
 from .splat_cloud import add_splats, cloud_attributes, normal_slopes, point_cloud, read_constants, read_splats
@@ -173,6 +174,11 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
         collection.objects.link(item)
         item.name = item.data.name = name
         item[run_parts.KEY] = "mesh"
+        for material in item.data.materials:
+            for link in principled(material).inputs["Base Color"].links:
+                # Blender's importer leaves the config's default for pictures of 8 bits. In a config of ACES 1.3 that is ACEScct.
+                if link.from_node.type == "TEX_IMAGE":
+                    set_color_space(link.from_node.image, SRGB)
     bpy.data.batch_remove(set(added) - set(meshes))
     if not meshes:
         raise InputError(f"{path} contains no mesh: export the run again")

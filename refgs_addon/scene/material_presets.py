@@ -9,6 +9,7 @@ from bl_operators.presets import AddPresetBase
 from .. import compat
 from ..errors import InputError
 from .atomic_file import atomic_write
+from .color_spaces import from_rec709, to_rec709
 
 ROOT = Path(__file__).resolve().parents[1]  # its folder `presets` has the add-on's own
 PRESETS = "refgs_material"  # subfolder for materials, in the add-on's and in the artist's presets
@@ -45,9 +46,9 @@ def set_material(edit: bpy.types.NodesModifier, name: str) -> None:
 
 
 def set_inputs(edit: bpy.types.NodesModifier, values: dict[str, float | tuple[float, ...]]) -> None:
-    """Set inputs of an edit. `values` maps the names of the inputs to their new values."""
+    """Set inputs of an edit. `values` maps the names of the inputs to their new values, as `read_material` returns them."""
     for name, value in values.items():
-        compat.set_modifier_input(edit, name, value)
+        compat.set_modifier_input(edit, name, from_rec709(value) if name == "Base Color" else value)
 
 
 def save_material(edit: bpy.types.NodesModifier, name: str) -> Path:
@@ -59,7 +60,9 @@ def save_material(edit: bpy.types.NodesModifier, name: str) -> Path:
     shown = bpy.path.display_name(file.name, title_case=False)
     if shown.casefold() in (known.casefold() for known in materials()):  # some file systems ignore case
         raise InputError(f"the material {shown} exists already: choose another name")
-    values = {key: _rounded(key, compat.get_modifier_input(edit, key)) for key in INPUTS}
+    values = {key: compat.get_modifier_input(edit, key) for key in INPUTS}
+    values["Base Color"] = to_rec709(tuple(values["Base Color"]))
+    values = {key: _rounded(key, value) for key, value in values.items()}
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

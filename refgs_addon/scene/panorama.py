@@ -9,6 +9,7 @@ from mathutils import Euler
 
 from .. import compat
 from ..nodes.world_diffuse import BANDS, THIRD
+from .color_spaces import to_rec709
 
 ROWS = 64  # of the downsampled panoramas that are compared
 FAINT = 0.01  # of the mean radiance: floor of the logarithm
@@ -22,7 +23,7 @@ def best_rotation(image: bpy.types.Image, other: bpy.types.Image) -> tuple[float
     solid angle. The factor is the mean luminance of `other` over the sphere, divided by that of `image`.
     """
     area = np.cos(np.pi * ((np.arange(ROWS) + 0.5) / ROWS - 0.5))[:, None]
-    small = [_reduced(picture) @ LUMINANCE for picture in (image, other)]
+    small = [to_rec709(_reduced(picture)) @ LUMINANCE for picture in (image, other)]
     means = [float((values * area).sum() / area.sum() / values.shape[1]) for values in small]
     seen = [np.log(values / max(mean, 1e-12) + FAINT) for values, mean in zip(small, means, strict=True)]
     # Columns run against the azimuth: after a rotation by a, column c shows what was at c + a W / 2π.
@@ -40,7 +41,7 @@ def diffuse_light(image: bpy.types.Image, rotation: Sequence[float]) -> tuple[np
     """Compute a panorama's diffuse light, and the factor by which Eevee weakens harmonics of degree 1 under this panorama.
 
     The diffuse light is the irradiance over π, as coefficients of nine spherical harmonics (9, 3), for `nodes.world_diffuse.set_harmonics`.
-    `rotation` rotates the environment: Euler angles in radians.
+    It is in Blender's working space, as Eevee's own light is. `rotation` rotates the environment: Euler angles in radians.
 
     For diffuse light, Eevee uses only the harmonics of degree 0 and 1. It multiplies the coefficients of degree 1 by the factor. The factor
     is at most 1, and the same for red, green and blue: the smallest that one of them needs. Let c be the coefficient of degree 0 of the
@@ -69,7 +70,7 @@ def diffuse_light(image: bpy.types.Image, rotation: Sequence[float]) -> tuple[np
 
 
 def _reduced(image: bpy.types.Image) -> np.ndarray:
-    """Resample a panorama to (ROWS, 2 · ROWS, 3) pixels by area averaging. The bottom row comes first."""
+    """Resample a panorama to (ROWS, 2 · ROWS, 3) pixels in the working space, by area averaging. The bottom row comes first."""
     width, height = image.size
     pixels = np.empty(width * height * image.channels, np.float32)
     image.pixels.foreach_get(pixels)

@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..nodes.splat_material import splat_material, values_material
 from ..nodes.splats_tree import NAME, splats_tree
 from ..ply_file import read_header, read_rows
+from .color_spaces import from_rec709
 
 MATERIALS = "albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"
 SURFACE = {"metallic": 0.0, "roughness": 1.0, "specular": 0.5}  # possible constants of a file, with their defaults
@@ -73,9 +74,12 @@ def cloud_attributes(
 
 
 def point_cloud(name: str, values: dict[str, np.ndarray]) -> bpy.types.PointCloud:
-    """Make a point cloud. `values` maps the name of each attribute to an array with one row for each point."""
+    """Make a point cloud. `values` maps the name of each attribute to an array with one row for each point.
+
+    Colours are linear Rec.709; the point cloud has them in Blender's working space.
+    """
     cloud = compat.new_point_cloud(name, len(values["position"]))
-    for key, value in values.items():
+    for key, value in (values | {"base_color": from_rec709(values["base_color"])}).items():
         kind = _TYPES.get(key, "FLOAT" if value.ndim == 1 else "FLOAT_VECTOR")
         attribute = cloud.attributes.get(key) or cloud.attributes.new(key, kind, "POINT")
         field = {"FLOAT": "value", "FLOAT_VECTOR": "vector", "FLOAT_COLOR": "color", "QUATERNION": "value"}[kind]
@@ -92,7 +96,7 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
     - scale (N, 2), in standard deviations;
     - rotation (N, 4), unit quaternions wxyz;
     - opacity, metallic and roughness (N,), all 0..1;
-    - base_color (N, 3), linear;
+    - base_color (N, 3), linear Rec.709;
     - doubt (N,), 0..1, only if the file has it: how little photos tell metal from paint.
 
     Splats without materials become matte; their base colour is that of their constant spherical harmonic. Splats without normals get their
