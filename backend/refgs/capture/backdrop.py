@@ -86,7 +86,8 @@ def find_plane(
 class Backdrop:
     """Hold the colours of a plane on a square grid of SIDE² texels around the object, and how much each colour differs between photos.
 
-    Colours are logarithms of 8-bit values, times STEPS. In this scale, a photo's exposure and white balance add a constant to each channel.
+    Colours are logarithms of 8-bit values, scaled to 0..255. On this scale, a photo's exposure and white balance add a constant to each
+    channel.
     """
 
     def __init__(self, plane: Plane, centre: np.ndarray, radius: float):
@@ -100,7 +101,7 @@ class Backdrop:
         self.to_world[3, 2] = 1
 
     def before(self, points: np.ndarray) -> np.ndarray:
-        """Tell which points (N, 3) lie in front of the plane by more than ABOVE times `self.radius`. Returns bool (N,)."""
+        """Mark the points (N, 3) that lie clearly in front of the plane, farther than ABOVE · `self.radius` from it, as bool (N,)."""
         return self.plane.height(points) > ABOVE * self.radius
 
     def learn(self, images: list[np.ndarray], cameras: list[Camera], hidden: list[np.ndarray]) -> None:
@@ -139,9 +140,11 @@ class Backdrop:
 
         A pixel's value depends on the texel that it would show if nothing hid the plane:
 
-        - The texel's colour is known: the probability, 0..1, that the plane has the pixel's colour, within a box in Lab of size BIN.
-        - The colour is not known, but the odds of object to bare plane are, as below the object: these odds with a minus sign.
-        - Neither is known, or there is no texel: NaN.
+        - If the texel's colour is known, the value is the probability, 0..1, that the bare plane shows the pixel's colour, in a histogram
+          with bins of size BIN (in Lab).
+        - If the colour is unknown, but the texel has odds of object to bare plane, the value is minus these odds. This is the case for
+          texels below the object.
+        - If the texel has neither, or if there is no texel, the value is NaN.
 
         `hidden` (H, W) is true at pixels that may show the object. The photo's exposure and noise are measured at the other pixels. If
         fewer than 200 of those have a texel of known colour, all values are NaN.

@@ -24,9 +24,9 @@ LARGE = 500e6  # bytes of all photos of a capture, from which on they are cached
 
 
 def load_views(views: list[View], max_side: int, folder: Path) -> list[LoadedView]:
-    """Load photos for training as `load_view` does. If they take more than LARGE bytes, cache them in `folder`.
+    """Load photos for training as `load_view` does. If they take much memory (more than LARGE bytes), cache them in `folder`.
 
-    The arrays of a cached photo are memory-mapped. Writing to them does not change the files, and is undone by `release_memory`. If the
+    The arrays of a cached photo are memory-mapped. Changes to an array are not written to its file. `release_memory` undoes them. If the
     disk is full, photos are held in memory. Raises InputError naming the photo that cannot be read.
     """
     cameras = [view.camera.fitted(max_side) for view in views]

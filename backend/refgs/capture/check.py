@@ -56,9 +56,9 @@ def check(capture: Capture, out: Path) -> dict[str, Any]:
 def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
     """Describe a capture in lines of text. At the end there are lines `Not used: …` and `Warning: …` for likely mistakes.
 
-    Decodes every photo, mask and prior (normals or depth that another program guessed). Raises InputError if some of these files cannot be
-    read: the message says for how many views, and names the first file. If the folder `thumbnails` is given, thumbnails of up to 12 photos
-    are written to it.
+    Decodes every photo, mask and prior (normals or depth that another program guessed). Raises InputError if any of these files cannot be
+    read. The message gives the number of views with such files, and names the first file. If the folder `thumbnails` is given, thumbnails
+    of up to 12 photos are written to it.
     """
     statistics = _decode_all(capture, thumbnails)
     return [
@@ -179,7 +179,7 @@ def _masks(capture: Capture, statistics: list[_Statistics]) -> str:
 
 
 def _priors(capture: Capture) -> list[str]:
-    """Report how many training photos have normals, and how many have depth, from other programs. Return a line for each, none for 0."""
+    """Return a line that counts the training photos with normals from other programs, and a line for depth. Omit a count of 0."""
     lines = []
     for name, field in FOLDERS.items():
         if count := sum(getattr(view, field) is not None for view in capture.train_views):
@@ -188,10 +188,10 @@ def _priors(capture: Capture) -> list[str]:
 
 
 def _guessed_object(capture: Capture) -> list[str]:
-    """Report the box in which a training would look for the object to make masks, as a list of one line.
+    """Return a list with one line of text: the box in which a training would look for the object.
 
-    Return [] if a training would make no masks: if a photo has a mask, if the layout stores masks in the photos, or if the cameras look
-    outwards. Also return [] if the user has set a box.
+    A training looks for the object to make masks. Return [] if it would make no masks: if a photo has a mask, if the layout stores masks in
+    the photos, or if the cameras look outwards. Also return [] if the user has set a box.
     """
     if any(view.masked for view in capture.views) or capture.layout in Z_UP or capture.box is not None:
         return []

@@ -1,8 +1,8 @@
 """Read COLMAP captures: a sparse model, binary or text, with photos in `images`, `input` or the capture's folder.
 
 The model is in one of the folders _MODELS. Some data sets, such as the real scenes of Ref-NeRF and mip-NeRF 360, also have reduced photos
-in `images_2`, `images_4` and `images_8`. To use reduced photos, pass the path of their folder in place of the capture's. They may have
-another file suffix than the photos that the model names.
+in `images_2`, `images_4` and `images_8`. To use reduced photos, pass the path of their folder in place of the capture's. Reduced photos may
+have another file suffix than the one in the model.
 """
 
 import re
@@ -35,8 +35,8 @@ from refgs.formats.colmap import (
 class Model(NamedTuple):
     """Hold where a COLMAP capture's files are: its sparse model `folder` and the folder of its `photos`.
 
-    `root` is the folder that holds the folder `masks`. `others` are the folders of the capture's other models, which are not used,
-    with the number of photos of each.
+    `root` is the folder that holds the folder `masks`. `others` lists the capture's other models, which are not used: a pair (folder,
+    number of photos) for each.
     """
 
     folder: Path
@@ -90,7 +90,7 @@ def _sorted(top: Path, pattern: str) -> list[Path]:
 def _is_model(folder: Path, pattern: str) -> bool:
     """Tell whether a folder, found by `pattern`, has a model: a file of cameras and a file of images.
 
-    In `sparse`, one of the two is enough. Reading the model then raises an error that names the missing file.
+    If `pattern` begins with "sparse", one of the two files is enough. Reading the model then raises an error that names the missing file.
     """
     there = [any((folder / f"{name}.{end}").is_file() for end in ("bin", "txt")) for name in ("cameras", "images")]
     return any(there) if pattern.startswith("sparse") else all(there)
@@ -147,7 +147,8 @@ def _passed_over(model: Model, count: int) -> list[str]:
 def _find(photos: Files, name: str) -> Path | None:
     """Find a photo by the name that the model gives it. Return None if it is missing.
 
-    If COLMAP was run on the folder above that of the photos, the name begins with a folder `images` or `input`. This is dropped if needed.
+    If COLMAP was run on the folder above that of the photos, the name begins with a folder `images` or `input`. If no photo has the whole
+    name, this folder is dropped from it.
     """
     first, _, rest = name.replace("\\", "/").partition("/")
     return photos.find(name) or (photos.find(rest) if fold(first) in PHOTO_FOLDERS else None)

@@ -35,13 +35,13 @@ INSIDE_FEATURES = (
 
 
 def choose_pairs(database: Path) -> list[tuple[int, int]]:
-    """Choose which photos in COLMAP's database to match. Returns pairs of photo indices, which follow the order of the file names.
+    """Choose which photos in COLMAP's database to match. Returns pairs of photo indices. Photos are numbered in order of their file names.
 
     With up to ALL_PAIRS photos, every pair is matched. With more, each photo is matched with two groups:
 
-    - The NEXT photos that follow it. In a video, or a walk around the object, they were taken nearby.
-    - Some photos that look similar. They link several walks around the object. They also help if the file names do not follow the
-      camera's path.
+    - Up to NEXT photos that follow it in this order. In a video, or a walk around the object, they were taken nearby.
+    - Some photos that look similar. They link several walks around the object. They also help if the file names do not follow the camera's
+      path.
     """
     import pycolmap
 
@@ -168,7 +168,7 @@ def map_one_by_one(photos: list[Path], database: Path, progress: Callable) -> li
     """Compute cameras from the feature matches, one photo after the other.
 
     Returns COLMAP's models (pycolmap.Reconstruction), the one with most photos first. If some photos could not be linked to the others,
-    there are several, which share few photos or none. `progress("mapping", done, total)` is called for each photo.
+    there are several models. Two models share few photos or none. `progress("mapping", done, total)` is called for each photo.
     """
     import pycolmap
 
@@ -198,8 +198,8 @@ def map_one_by_one(photos: list[Path], database: Path, progress: Callable) -> li
 def map_at_once(photos: list[Path], database: Path) -> list[Any]:
     """Compute all cameras together (GLOMAP). Return the models as `map_one_by_one` does.
 
-    GLOMAP also links photos that share too little to be placed one after the other. For some photos it only finds the direction from other
-    photos, but not the distance, because they share too few points with them. This function removes the cameras of these photos.
+    GLOMAP also links photos that share too little to be placed one after the other. If a photo shares too few points with the others,
+    GLOMAP finds its direction from them, but not its distance. This function removes the cameras of such photos.
     """
     import pycolmap
 
@@ -217,8 +217,9 @@ def map_at_once(photos: list[Path], database: Path) -> list[Any]:
 def _tied(model: Any) -> set[int]:
     """Return the image IDs of a model's images that are tied together by common points.
 
-    The first two tied images are those that share most points. Another image is tied if it shows at least TIED points, each of which at
-    least two tied images show. The distance of an image that is not tied is unknown, because the relative pose of two photos has no scale.
+    The first two tied images are those that share most points. A point is known if at least two tied images show it. Another image is tied
+    if it shows at least TIED known points. The distance of an image that is not tied is unknown, because the relative pose of two photos
+    has no scale.
     """
     shown = {
         number: {seen.point3D_id for seen in model.image(number).get_observation_points2D()}
@@ -256,8 +257,8 @@ def unexplained_part(model: Any, database: Path) -> float:
     """Return the fraction of feature matches that the cameras of a model (a pycolmap.Reconstruction) do not explain.
 
     A match is explained if both its photos have cameras, and its points are at most MATCH_TOLERANCE pixels from their epipolar lines.
-    Matches of photos without cameras count as unexplained, to detect an object that turns in a room that stands still. COLMAP may then find
-    cameras only for photos whose matches follow the object, and none for photos whose matches follow the room.
+    Matches of photos without cameras count as unexplained. This detects an object that turns, as on a turntable, while the room stands
+    still. COLMAP may then find cameras only for photos whose matches follow the object, and none for photos whose matches follow the room.
     """
     import pycolmap
 

@@ -153,7 +153,7 @@ def declared_profile(picture: Image.Image, path: Path) -> Profile | LookUp | Non
 
 
 def coded_profile(primaries: int, transfer: int, path: Path) -> Profile | None:
-    """Return the profile for two code points of H.273: of the colour primaries and of the transfer curve. Return None for those of sRGB.
+    """Return the profile for two code points of H.273, one of colour primaries and one of a transfer curve. Return None if it is sRGB.
 
     Also return None for unknown code points. An InputWarning then names the file `path`, once for each reason.
     """
@@ -210,8 +210,8 @@ def _of_code_points(primaries: int, transfer: int) -> Profile:
 def _of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Profile:
     """Return the profile of a PNG's gAMA (`gamma`) and cHRM (`chromaticities`: x and y of white, red, green and blue).
 
-    A gamma of 0.45455 stands for sRGB's curve, because the PNG specification lets encoders write this number for sRGB. So does None. None
-    for `chromaticities` stands for Rec.709. Raises Unusable.
+    A gamma of 0.45455 stands for sRGB's curve, because the PNG specification lets encoders write this number for sRGB. Without `gamma`, the
+    curve is sRGB's, too. Without `chromaticities`, the primaries are those of Rec.709. Raises Unusable.
     """
     curve = srgb_decode if not gamma or abs(gamma - 0.45455) < 5e-5 else _power(1 / gamma)  # Adobe RGB has 0.45471
     white, primaries = (chromaticities[:2], chromaticities[2:]) if chromaticities else ((), ())
@@ -277,7 +277,7 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _associated(ipma: bytes, item: int) -> list[int]:
-    """Return which properties belong to an item, by the box ipma (ISO/IEC 23008-12, 9.3.2). They are numbers, counted from 1."""
+    """Return the numbers, counted from 1, of the properties that belong to an item, by the box ipma (ISO/IEC 23008-12, 9.3.2)."""
     version, wide, count, at = ipma[0], ipma[3] & 1, int.from_bytes(ipma[4:8], "big"), 8
     for _ in range(count):
         size = 2 if version < 1 else 4
@@ -364,7 +364,7 @@ def _check_mode(profile: Profile | LookUp, mode: str) -> None:
 
 @lru_cache(32)
 def _table(profile: Profile, size: int) -> np.ndarray:
-    """Return the linear values of the codes 0 to `size` − 1 by the curves of a profile's three channels, float32 (size, 3)."""
+    """Apply the curves of a profile's three channels to the codes 0 to `size` − 1. Return the linear values, float32 (size, 3)."""
     codes = np.arange(size) / (size - 1)
     with np.errstate(all="ignore"):  # a broken profile's numbers
         values = np.stack([curve(codes) for curve in profile.curves], axis=1)

@@ -1,4 +1,4 @@
-"""Hash the contents of a capture's files. A run keeps the hashes, to notice when a file was changed since it was trained on."""
+"""Hash the contents of a capture's files. A run keeps the hashes, so that later changes of these files are noticed."""
 
 import hashlib
 import json

@@ -45,7 +45,7 @@ def without_suffix(name: str) -> str:
 
 
 def without_mask_word(name: str) -> str:
-    """Return a mask's name, which has no suffix, without the word that tells it from its photo: `0001` for `0001_mask`."""
+    """Remove the word for mask, if any, from a file name without suffix: `0001_mask` becomes `0001`, the name of its photo."""
     found = _MASK_WORDS.fullmatch(name)
     return name if found is None else found["after"] or found["before"]
 
@@ -53,8 +53,8 @@ def without_mask_word(name: str) -> str:
 class _Listing(NamedTuple):
     """Hold the names in a folder.
 
-    `files` and `folders` map each name's folded form (see `fold`) to the names that have it. `stems` does the same for the folded names of
-    images without suffix.
+    `files` and `folders` map a folded name (see `fold`) to all names in the folder that have this folded form. `stems` maps an image's
+    folded name without suffix to the names of all such images.
     """
 
     files: dict[str, list[str]]
@@ -65,8 +65,9 @@ class _Listing(NamedTuple):
 class Files:
     """Find a capture's files by the names that the capture gives them. Each folder is listed only once.
 
-    A name may differ from the file's: in letter case, in Unicode's form, by `\\` for `/`, or by a missing or other image suffix. It may
-    also be an absolute path on another machine. All names of the same file lead to the same path. `folder` is the capture's.
+    A name may differ from the file's in letter case or in Unicode's form. It may have `\\` in place of `/`, and another image suffix or
+    none. It may also be an absolute path on another machine. All names of the same file lead to the same path. `folder` is the capture's
+    folder.
     """
 
     def __init__(self, folder: Path):
@@ -145,7 +146,7 @@ class Files:
                 yield folder, parts[-1]
 
     def _own(self, folder: Path) -> Path:
-        """Return a folder's path below `self.folder` if it lies there after links are resolved. Otherwise return it unchanged."""
+        """Resolve the links in a folder's path. If it then lies in `self.folder`, return its path there, otherwise `folder` unchanged."""
         if folder not in self._owned:
             real, top = os.path.realpath(folder), os.path.realpath(self.folder)
             inside = real == top or real.startswith(os.path.join(top, ""))
@@ -187,7 +188,7 @@ def _preference(name: str) -> tuple[int, str]:
 
 
 def photo_folder(files: Files) -> Path:
-    """Return the folder of a capture's photos: `images` or `input` if images are in it or below it, otherwise the capture's folder."""
+    """Return the subfolder `images` or `input` if images are somewhere in it. If neither has images, return the capture's folder."""
     for name in PHOTO_FOLDERS:
         folder = files.find_folder(name)
         if folder is not None and next(files.all_images(folder), None) is not None:
@@ -196,10 +197,11 @@ def photo_folder(files: Files) -> Path:
 
 
 def find_photos(folder: Path) -> list[Path]:
-    """List the photos in the subfolder `images` or `input` and its subfolders, or in the folder itself if it has no such subfolder.
+    """List the photos in the subfolder `images` or `input`, and in its subfolders.
 
-    They are sorted by name. A mask beside its photo, such as NAME_alpha.png, is not listed. RAW or EXR is not listed if another image in
-    the same folder has the same name: many cameras write a photo as RAW and as JPEG.
+    If neither subfolder has images, list the photos in the folder itself. Photos are sorted by name in each folder. A mask beside its
+    photo, such as NAME_alpha.png, is not listed. RAW or EXR is not listed if another image in the same folder has the same name: many
+    cameras write a photo as RAW and as JPEG.
     """
     files = Files(folder)
     top = photo_folder(files)
@@ -223,8 +225,8 @@ def leave_out_missing(source: Path, found: list[tuple[T, str, Path | None]]) -> 
     """Leave out photos whose files are missing: the user may have removed blurred ones. Raises InputError if more than half are missing.
 
     `found` has a tuple for each photo: any object that belongs to it, its name, and its file or None. Returns the pairs (object, file) of
-    the photos that have a file, and a list with one warning if any have none. `source` is the file or folder that names the photos. If
-    more than half are missing, `source` probably belongs to another capture, or was moved.
+    the photos that have a file, and a list with one warning if any photo is missing, otherwise an empty list. `source` is the file or
+    folder that names the photos. If more than half are missing, `source` probably belongs to another capture, or was moved.
     """
     missing = [name for _, name, file in found if file is None]
     if 2 * len(missing) > len(found):
@@ -250,9 +252,9 @@ def photo_view(
     """Combine a photo, its camera and its mask in a View.
 
     `as_given` is the camera and lens from the capture's file. Camera and lens are scaled if they are for another resolution than the
-    photo's. If the photo has an EXIF orientation, they are turned upright with it, because COLMAP and nerfstudio make cameras for photos as
-    stored. If the camera's size fits the upright photo but not the stored one, they are not turned. `mask_below` is set only for a mask
-    that is a depth map (see `View`).
+    photo's. If the photo has an EXIF orientation, camera and lens are turned upright like the photo, because COLMAP and nerfstudio make
+    cameras for photos as stored. Camera and lens are not turned if the camera's size fits the upright photo, but not the stored one.
+    `mask_below` is set only for a mask that is a depth map (see `View`).
 
     Raises InputError if the photo's aspect ratio differs from the camera's, or the mask's size from the photo's. `where` is a name for the
     camera in error messages.

@@ -39,10 +39,10 @@ def first_points(
 ) -> FirstPoints:
     """Choose the points at which surfels start.
 
-    If all photos have masks, most points lie on the visual hull of the masks. These points come first. The others lie inside the hull,
-    because the hull fills the object's hollows, which masks do not show. With `hollows`, the hull is first carved where photos see through
-    it to a surface behind (see `hollows.carve_hollows`). This carving needs a light that does not move. If any photo has no mask, the
-    points are those of structure from motion, or random. There are at most `surfels.start` and at most `surfels.budget` points.
+    If all photos have masks, most points lie on the visual hull of the masks. These points come first. The other points lie inside the
+    hull, because the object may have hollows, which masks do not show. With `hollows`, the hull is first carved where photos see through it
+    to a surface behind (see `hollows.carve_hollows`). This carving needs a light that does not move. If any photo has no mask, the points
+    are those of structure from motion, or random. There are at most `surfels.start` and at most `surfels.budget` points.
     """
     count = min(surfels.start, surfels.budget)
     if all(view.alpha is not None for view in views):
@@ -117,7 +117,7 @@ def _enough(points: np.ndarray, box: Box | None) -> bool:
 
 
 def _thinned(points: np.ndarray, capture: Capture, count: int, seed: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Choose at random at most `count` of the `points` (N, 3). Returns them, and their sRGB colours in 0..1, or None if unknown."""
+    """Choose at random at most `count` of the `points` (N, 3). Returns the chosen points and their sRGB colours (None if unknown)."""
     colours, chosen = capture.point_colors, slice(None)
     if capture.box is not None:
         chosen = np.concatenate(_in_and_around(capture.box, points, points, count, seed))
@@ -127,10 +127,10 @@ def _thinned(points: np.ndarray, capture: Capture, count: int, seed: int) -> tup
 
 
 def _random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
-    """Place `count` points at random: evenly in the user's box, or in the ball that the cameras look at if there is no box.
+    """Place `count` points at random: evenly in the user's box. If there is no box, place them in the ball that the cameras look at.
 
-    In a room or open scene, or if there is a box, up to half of the points are placed farther out, for the surroundings. The inverse
-    distances of these points from the centre are uniform.
+    In two cases, up to half of the points are placed farther out, for what is around the box or the ball: if there is a box, and if the
+    photos show a room or an open scene. The inverse distances of these points from the centre are uniform.
     """
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))

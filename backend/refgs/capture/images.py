@@ -97,7 +97,7 @@ class LoadedView:
 
     @property
     def clipped(self) -> np.ndarray:
-        """Tell which channels of the pixels are clipped, bool (H, W, 3). JPEG changes codes a little, so nearly clipped ones count, too."""
+        """Mark the clipped channels of the pixels, bool (H, W, 3). JPEG changes values a little, so nearly clipped channels count, too."""
         return self.image >= np.iinfo(self.image.dtype).max // 255 * 254
 
 
@@ -157,10 +157,10 @@ def read_focal_length(path: Path) -> float | None:
 def read_image(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
     """Decode an image file to RGB (H, W, 3) uint8 and alpha (H, W) uint8, None without alpha.
 
-    The image is turned upright by its EXIF orientation. Greyscale files and those with more than 8 bits are converted to 8-bit RGB.
-    Colours are converted to sRGB by the file's profile; with `is_data`, as for normals, codes stay as stored. `shrink` is 1, 2, 4 or 8. A
-    JPEG's sides are divided by `shrink`, or by the largest smaller power of 2 that divides both. A RAW photo's sides are halved at most,
-    and other formats are not reduced. Raises InputError naming the file if it is truncated or unreadable.
+    The image is turned upright by its EXIF orientation. Greyscale files and those with more than 8 bits are converted to 8-bit RGB. Colours
+    are converted to sRGB by the file's profile; with `is_data`, as for normals, codes stay as stored. `shrink` is 1, 2, 4 or 8. A JPEG's
+    sides are divided by `shrink`. If this leaves a remainder, `shrink` is halved until both sides can be divided by it. A RAW photo's sides
+    are halved at most, and other formats are not reduced. Raises InputError naming the file if it is truncated or unreadable.
     """
     image, alpha, white = read_codes(path, shrink, is_data)
     return as_bytes(image, white), alpha
@@ -214,10 +214,11 @@ def _exr_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def write_for_colmap(path: Path, out: Path) -> bool:
-    """Write a photo's pixels to the JPEG `out` if COLMAP may not read them: HEIC, RAW, EXR and others, or TIFF not stored upright.
+    """Write a photo's pixels to the JPEG `out` if COLMAP may be unable to read the photo.
 
-    Return whether the JPEG was written. Its pixels are not turned upright: its size is the `width` and `height` of the photo's `Header`.
-    Raises InputError naming the file.
+    COLMAP reads JPEG, PNG, BMP, and TIFF that is stored upright. All other photos are written, such as HEIC, RAW and EXR. Return whether
+    the JPEG was written. Pixels are not turned upright: the size of the JPEG is the `width` and `height` of the photo's `Header`. Raises
+    InputError naming the file.
     """
     if _is_raw(path) or _is_exr(path):
         stored = np.rot90(read_image(path)[0], read_header(path).turns)
@@ -287,8 +288,8 @@ def _stored_numbers(path: Path) -> np.ndarray | None:
 def read_alpha(view: View) -> np.ndarray | None:
     """Return a photo's mask (H, W) uint8, or None if it has none. The mask has the photo's full size, and is upright but not undistorted.
 
-    Some mask files have no EXIF orientation, but are stored in the orientation of their photo. A mask file that does not have the size of
-    the upright photo is therefore turned as the photo's EXIF says.
+    Some programs store a mask turned like the photo's stored pixels, but without an EXIF orientation. Therefore a mask file whose size is
+    not that of the upright photo is turned as the photo's EXIF says.
     """
     if view.mask_path is None:
         return read_image(view.image_path, is_data=True)[1] if view.has_alpha else None
@@ -307,8 +308,8 @@ def load_view(view: View, max_side: int | None = None) -> LoadedView:
     """Load a photo for training: decode it, apply its mask, undistort it, and reduce its longer side to `max_side` pixels, if given.
 
     When a photo is reduced, linear radiance is averaged over each new pixel's area, as a coarser sensor would do. The average is weighted
-    by alpha, so that colours outside the mask do not bleed into its edge. A much larger JPEG is first reduced by its decoder, to SPARE
-    times the new size or more. The decoder averages encoded values, and ignores the mask.
+    by alpha, so that colours outside the mask do not bleed into its edge. If a JPEG is much larger than the result, its decoder reduces it
+    first, to at least SPARE times the size of the result. The decoder averages encoded values, and ignores the mask.
 
     Raises InputError naming the file.
     """
@@ -343,7 +344,7 @@ def _is_exr(path: Path) -> bool:
 
 
 def _divisor(shrink: int, width: int, height: int) -> int:
-    """Halve `shrink`, a power of two, until it divides both sides."""
+    """Halve `shrink`, a power of two, until both `width` and `height` can be divided by it."""
     while width % shrink or height % shrink:
         shrink //= 2
     return shrink
@@ -416,7 +417,7 @@ def _decode(picture: Image.Image, path: Path, look_up: LookUp | None = None) -> 
 def _as_array(picture: Image.Image, look_up: LookUp | None) -> np.ndarray:
     """Copy a picture to an RGB or RGBA array (H, W, 3 | 4) uint8, converted by `look_up` if that is given.
 
-    The picture is copied in strips, to save memory: Pillow makes another copy of what it hands out.
+    To save memory, the picture is copied in strips: Pillow makes a temporary copy of each strip.
     """
     mode = "RGBA" if picture.mode == "RGBA" else "RGB"
     pixels = np.empty((picture.height, picture.width, len(mode)), np.uint8)

@@ -111,7 +111,7 @@ class Lens:
     def maps(self, camera: Camera, rows: slice = ALL) -> tuple[np.ndarray, np.ndarray]:
         """Return the maps that `cv2.remap` needs to undistort the photo: columns and rows, each (R, W) float32.
 
-        They say, for each pixel in these `rows` of the pinhole `camera`, where it lies in the distorted photo.
+        For each pixel in these `rows` of the undistorted photo (of the pinhole `camera`), they hold its position in the distorted photo.
         """
         x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
         y = (np.arange(camera.height)[rows] + 0.5 - camera.cy) / camera.fy
@@ -122,7 +122,7 @@ class Lens:
     def maps_back(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Return the maps that `cv2.remap` needs to distort a picture of the pinhole `camera`: columns and rows, each (H, W) float32.
 
-        They say, for each pixel of the distorted photo, where it lies in the undistorted one.
+        For each pixel of the distorted picture, they hold its position in the undistorted picture.
         """
         x_seen = ((np.arange(camera.width) + 0.5 - self.cx) / self.fx)[None, :]
         y_seen = ((np.arange(camera.height) + 0.5 - self.cy) / self.fy)[:, None]
@@ -180,8 +180,8 @@ def _colmap_camera(model: str, coefficients: tuple[float, ...]) -> Any:
 def _focal_factor(lens: Lens, width: int, height: int) -> float | None:
     """Find the smallest factor for the focal lengths with which the undistorted photo has no black borders.
 
-    A larger factor zooms in, so that more pixels lie inside the distorted photo. The result is at least WIDEST. Return None if a factor of
-    2 is not enough.
+    A larger factor zooms in, so that more pixels lie inside the distorted photo. The result is at least WIDEST, because the centre of a
+    fisheye photo would lose too much resolution otherwise. Return None if there are black borders even with a factor of 2.
     """
     u, v = np.meshgrid(np.linspace(0, width, 65), np.linspace(0, height, 65))
 

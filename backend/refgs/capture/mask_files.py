@@ -12,11 +12,17 @@ from refgs.capture.files import MASK_FOLDERS, Files, fold, without_mask_word, wi
 def find_masks(files: Files, photos: list[Path]) -> dict[Path, Path]:
     """Return the mask file of each photo that has one.
 
-    The mask of NAME.jpg is NAME.png or NAME.jpg.png in the folder `masks`, or the same with another image suffix. It may also be named
-    NAME_mask.png, mask_NAME.png or NAME.jpg.mask.png, and lie in another of MASK_FOLDERS. If photos are in subfolders, their masks are in
-    subfolders of `masks` with the same names, in `masks` itself if no two photos have the same name, or in a folder `masks` beside the
-    photos or their folder. If there is no such mask, NAME_alpha.png, NAME_mask.png or the like beside the photo is used, as in the scene
-    `ball` of Shiny Blender.
+    The mask of NAME.jpg is in the folder `masks`, or in another of MASK_FOLDERS. It is called NAME.png, NAME.jpg.png, NAME_mask.png,
+    mask_NAME.png or NAME.jpg.mask.png. It may have another image suffix than .png.
+
+    If photos are in subfolders, their masks are in one of these places:
+
+    - in subfolders of `masks` with the same names
+    - in `masks` itself, if no two photos have the same name
+    - in a folder `masks` beside the photos, or beside the folder of the photos
+
+    If a photo has no such mask, a mask beside the photo is used, such as NAME_alpha.png or NAME_mask.png. The scene `ball` of Shiny Blender
+    has such masks.
     """
     found: dict[Path, Path] = {}
     beside, together = {}, {}

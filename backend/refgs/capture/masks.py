@@ -169,9 +169,13 @@ def with_masks(
 def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, float]:
     """Guess a box around the object: a cube around the point at which the cameras look.
 
-    The guess uses the cameras of `views` and the capture's point cloud, but no masks. Returns the box, the fraction of each of its edges
-    that the object is likely to fill, and the radius of the region of interest, in the units of the views' cameras. Raises InputError if
-    the cameras look outwards, as in a room.
+    The guess uses the cameras of `views` and the capture's point cloud, but no masks. Returns three values:
+
+    - the box, in the coordinates of these cameras
+    - the likely size of the object, as a fraction of the box's edge length
+    - the radius of the region of interest, in the units of these cameras
+
+    Raises InputError if the cameras look outwards, as in a room.
     """
     found = find_region(views, up_direction(views), capture.points, [])
     if found.because == LOOK_OUT:
@@ -194,7 +198,7 @@ def region_settings(box: Box) -> list[str]:
 
 
 def moved_region(wanted: RegionSettings, moved: list[list[float]]) -> RegionSettings:
-    """Convert the box `wanted` to the frame that a training has with new masks. `moved` (4, 4) is in the dict that `make_masks` returns."""
+    """Convert the box `wanted` to the run's frame that results from new masks. `moved` (4, 4) is in the dict that `make_masks` returns."""
     scale = sum(row[0] ** 2 for row in moved[:3]) ** 0.5
     centre = tuple(sum(a * b for a, b in zip(row, (*wanted.centre, 1.0), strict=True)) for row in moved[:3])
     return wanted.model_copy(update={"centre": centre, "size": tuple(scale * edge for edge in wanted.size)})
@@ -235,7 +239,10 @@ def _root(capture: Capture) -> Path:
 
 
 def _inner(view: View, root: Path) -> Path:
-    """Return a photo's path relative to `root`, without its first folder, such as `images`. A mask has its photo's path in `masks`."""
+    """Return a photo's path relative to `root`, without its first folder, such as `images`.
+
+    The photo's mask has the same path in the folder `masks`, apart from the suffix. Raises InputError if the photo is not in `root`.
+    """
     if not view.image_path.is_relative_to(root):
         raise InputError(f"{view.image_path}: the photo is not in the capture's folder {root}. Move it there.")
     path = view.image_path.relative_to(root)
@@ -296,7 +303,10 @@ class _Judge:
 
 
 def _load(view: View, root: Path, side: int, judge: _Judge | None) -> Photo:
-    """Load a photo, undistorted and reduced. Add what the artist's mask or strokes say about its pixels, and the model's probabilities."""
+    """Load a photo, undistorted and reduced to `side` pixels on its longer side.
+
+    Return a Photo. Its `known` comes from the artist's mask or strokes, its `salient` from the segmentation model `judge`, if given.
+    """
     loaded = load_view(view, side)
     known = np.zeros(loaded.image.shape[:2], np.int8)
     if loaded.alpha is not None:

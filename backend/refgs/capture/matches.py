@@ -36,8 +36,8 @@ def match_neighbours(views: list[LoadedView]) -> list[Matches]:
     """Match the features of some photos, evenly spread, each with the photo of the nearest camera. Use only pixels inside the masks.
 
     For each pair of photos, an epipolar geometry is fitted to the matches, without using the cameras. Matches that do not fit it are
-    dropped. If most matches of a pair do not fit, the pair is left out, because the few that fit may do so by chance. A pair with fewer
-    than LEAST matches is left out, too. Some matches may be wrong: a reflection moves over the surface when the camera moves.
+    dropped. If most matches of a pair do not fit, the pair is left out, because the few that fit may do so by chance. A pair with too few
+    matches is left out, too. Some matches may be wrong: a reflection moves over the surface when the camera moves.
     """
     if len(views) < 2:
         return []
@@ -56,9 +56,9 @@ def match_neighbours(views: list[LoadedView]) -> list[Matches]:
 def pixels_apart(matches: list[Matches], cameras: list[Camera]) -> float | None:
     """Return how far matches are from their epipolar lines, in pixels of photos reduced to SIDE.
 
-    The result is the lower quartile of the pairs' medians, or None if there are fewer than LEAST_PAIRS pairs. A mean would be too high,
-    because matches of reflections in the object are wrong even for correct cameras. `cameras` are those of the matched views, in the same
-    order.
+    The median distance is computed for each pair of photos. The result is the lower quartile of these medians. It is None if there are too
+    few pairs (fewer than LEAST_PAIRS). A mean would be too high, because matches of reflections in the object are wrong even for correct
+    cameras. `cameras` are those of the matched views, in the same order.
     """
     medians = []
     for pair in matches:
@@ -91,7 +91,10 @@ def _features(view: LoadedView) -> tuple[np.ndarray, np.ndarray | None]:
 def _match(
     ours: tuple[np.ndarray, np.ndarray | None], theirs: tuple[np.ndarray, np.ndarray | None]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match two results of `_features`. Returns the pixels (M, 2) in both photos, of distinct matches that fit one epipolar geometry."""
+    """Match two results of `_features`. Returns the matched pixels in the first photo (M, 2) and in the second photo (M, 2).
+
+    A match is kept if it is clearly better than the second-best match, and if it fits the epipolar geometry of most matches.
+    """
     nothing = np.zeros((0, 2)), np.zeros((0, 2))
     (first, described), (second, others) = ours, theirs
     if described is None or others is None or min(len(described), len(others)) < LEAST:

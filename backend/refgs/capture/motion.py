@@ -72,14 +72,17 @@ class _Found(NamedTuple):
 def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) -> dict[str, Any]:
     """Find the cameras of the photos that `find_photos` lists. Write them to the folder's subfolder `sparse/0` as a COLMAP model.
 
-    The whole photos are used first. The cameras are then found anew from the pixels inside the masks, if all photos have masks, and too few
-    photos got a camera or the cameras leave many feature matches unexplained. An object on a turntable needs this.
+    The whole photos are used first. This can fail in two ways: too few photos get a camera, or the cameras leave many feature matches
+    unexplained, as for an object on a turntable. If it fails and all photos have masks, the cameras are found anew from the pixels inside
+    the masks.
 
     Returns a dict: `photos` is the number of photos, `placed` is how many of them got a camera, `error` is the mean reprojection error in
     pixels, and `inside` is true if only the pixels inside the masks were used.
 
-    `report(event, facts)` is called with "progress" and a dict of `stage` ("features", "matching" or "mapping"), `done` and `total`, or
-    with "warning" and a dict with the text `what`.
+    `report(event, facts)` is called with one of two events:
+
+    - "progress": the dict `facts` has `stage` ("features", "matching" or "mapping"), `done` and `total`.
+    - "warning": the dict `facts` has the text `what`.
 
     An interrupted call leaves `sparse.tmp`. The next call for the same photos resumes from it. Raises InputError if there are fewer than
     three photos, if all masks are empty, if there are cameras already, if fewer than half of the photos got a camera, or if the photos fall
@@ -279,7 +282,7 @@ def _run_colmap(
 
 
 def _search(photos: list[Path], masks: list[Path], database: Path, progress: Callable) -> tuple[Any, _Found]:
-    """Find cameras from the whole photos, or only from the pixels inside the masks if `masks` is not empty.
+    """Find cameras from the pixels inside the masks. If `masks` is empty, use the whole photos.
 
     Returns the largest model and a _Found about it. The model is a pycolmap.Reconstruction, whose images are named by the photos' indices.
     It is None if no photo got a camera.

@@ -3,8 +3,8 @@
 NeRF-Synthetic and Shiny Blender have this layout. If the test file is missing, `transforms_val.json` is used for testing.
 
 Shiny Blender also has true normals, NAME_normal.png. They are encoded as Ref-NeRF's code reads them (class `Blender` in multinerf's
-`internal/datasets.py`). Its scene `ball` has masks, NAME_alpha.png. Other images are ignored: depth, disparity, and NeRF-Synthetic's
-NAME_normal_0000.png, whose encoding is undocumented.
+`internal/datasets.py`). The scene `ball` of Shiny Blender has masks, NAME_alpha.png. Other images are ignored: depth, disparity, and
+NeRF-Synthetic's NAME_normal_0000.png, whose encoding is undocumented.
 """
 
 from dataclasses import replace

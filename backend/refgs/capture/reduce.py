@@ -21,8 +21,8 @@ def reduced(
     """Undistort a photo by `lens`, if given, and reduce it from the size of `camera` to that of `fitted`. Returns new codes and alpha.
 
     `image` (H, W, 3) are sRGB codes, uint8 or uint16, in which `white` is the code of radiance 1. `alpha` (H, W) is uint8 or None. Linear
-    radiance is averaged over each new pixel's area, weighted by alpha. The new alpha is None if `alpha` is; else fully transparent pixels
-    are black.
+    radiance is averaged over each new pixel's area, weighted by alpha. If `alpha` is None, the new alpha is None, too. Otherwise fully
+    transparent pixels are black.
     """
     size = fitted.height, fitted.width
     codes, opaque = np.empty((*size, 3), image.dtype), None if alpha is None else np.empty(size, np.uint8)
@@ -51,7 +51,8 @@ def reduced(
 def reduced_map(values: np.ndarray, alpha: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Reduce a map (H, W) or (H, W, C), such as normals, and its alpha (H, W) to the size of `camera`, both as float32.
 
-    Values are averaged over each new pixel's area, weighted by alpha; they are 0 where alpha is. A mean of unit vectors is shorter than 1.
+    Values are averaged over each new pixel's area, weighted by alpha. They are 0 where alpha is 0. Means of unit vectors are shorter than
+    1.
     """
     weights = alpha if values.ndim == 2 else alpha[..., None]
     size = camera.width, camera.height

@@ -113,8 +113,9 @@ def look_at_centre(views: list[View]) -> tuple[np.ndarray, np.ndarray, float]:
 def warn_of_axes(layout: str, views: list[View]) -> list[str]:
     """Return a list with one warning if a JSON file's axes look like OpenCV's: cameras look away from where their optical axes meet.
 
-    Return [] otherwise, and for other layouts. The axes of cameras that look out of a room hardly meet, so these cause no warning. Cameras
-    on a rig may look outwards and have axes that meet. So this is only a warning: the file is still read with the axes of its format.
+    Return [] otherwise, and for layouts other than "nerfstudio" and "nerf-blender". Cameras that look out of a room cause no warning,
+    because their axes hardly meet. Cameras on a rig cause a wrong warning if they look outwards and their axes meet. So this is only a
+    warning: the file is still read with the axes of its format.
     """
     _, depth, miss = look_at_centre(views)
     if layout not in ("nerfstudio", "nerf-blender") or (depth < 0).mean() < 0.75 or miss > 0.25:

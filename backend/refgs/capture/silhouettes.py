@@ -1,10 +1,15 @@
 """Find an object's silhouettes in photos with known cameras: the pixels that have the object's colours, and agree with a carved shape.
 
-Photos are segmented together (after Campbell et al. 2010, "Automatic 3D object segmentation in multiple views").
-Each voxel of a grid holds the probability that it lies in the object. Two steps alternate: the colour histograms of object and surroundings
-are learned from the voxels' projection; and voxels are kept where nearly all photos show the object's colours. GrabCut (OpenCV) then finds
-the exact edges. Neighbouring photos tell a hole from a highlight: a voxel in a hole shows the surroundings' colours in both, a voxel at a
-highlight only in one, because the highlight moves over the surface.
+Photos are segmented together (after Campbell et al. 2010, "Automatic 3D object segmentation in multiple views"). Each voxel of a grid holds
+the probability that it lies in the object. Two steps alternate:
+
+- Project the voxels into the photos, and learn two colour histograms there: of the object, and of its surroundings.
+- Keep the voxels at which nearly all photos show the object's colours.
+
+GrabCut (OpenCV) then finds the exact edges.
+
+A highlight can look like a hole, so two neighbouring photos are compared. A voxel in a hole shows the surroundings' colours in both photos.
+A voxel at a highlight shows them in only one photo, because the highlight moves over the surface.
 """
 
 from dataclasses import dataclass
@@ -176,8 +181,8 @@ def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
 def _only_connected(mask: np.ndarray, solid: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Drop the parts of a mask that do not touch the shape's projection `solid`, and close the holes that the shape does not have.
 
-    The closed holes are highlights, which GrabCut took for surroundings. A part is also kept if `known` is 1 somewhere in it, and a hole
-    if `known` is −1. Returns bool (H, W).
+    The closed holes are highlights, which GrabCut took for surroundings. There are two exceptions. A part also stays if `known` is 1
+    somewhere in it, and a hole stays open if `known` is −1 somewhere in it. Returns bool (H, W).
     """
     _, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     kept = np.isin(parts, np.unique(parts[(mask > 0) & (solid | (known > 0))])) & (mask > 0)
@@ -188,7 +193,9 @@ def _only_connected(mask: np.ndarray, solid: np.ndarray, known: np.ndarray) -> n
 
 
 def _neighbours(photos: list[Photo], centre: np.ndarray) -> np.ndarray:
-    """Pair each photo with a neighbour: their directions from `centre` differ by 5° to 40°, as little as possible.
+    """Pair each photo with a neighbour, by the directions of their cameras from `centre`.
+
+    A neighbour's direction differs by at least 5° and at most 40°. The neighbour with the least difference is chosen.
 
     Returns indices of photos (N, 2). Photos without a neighbour are left out.
     """
@@ -253,8 +260,11 @@ def _surroundings(ours: np.ndarray, theirs: np.ndarray, plain: np.ndarray | None
     """Return the likelihood of each pixel's colour if the pixel shows the surroundings, (H, W).
 
     `ours` and `theirs` (H, W) are the colour's likelihoods by the histograms of the object and of the surroundings. `plain` (H, W) is the
-    result of `Backdrop.likelihood`, or None. Where it is a likelihood, the result is mostly `plain`. Where it is negative, it is minus the
-    odds of object to plane, and the result is `ours` divided by these odds. Where it is NaN or None, the result is `theirs`.
+    result of `Backdrop.likelihood`, or None. There are three cases:
+
+    - `plain` is 0 or more: the likelihood of the colour on the bare plane. The result is mostly `plain`.
+    - `plain` is negative: minus the odds of object to plane. The result is `ours` divided by these odds.
+    - `plain` is NaN or None: nothing is known of the plane. The result is `theirs`.
     """
     if plain is None:
         return theirs
@@ -267,10 +277,10 @@ def _weights(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return two weights of each pixel (H, W): in the histogram of the object's colours, and in that of the surroundings'.
 
-    `prior` (H, W) is the shape's projection, and `plain` (H, W) the result of `Backdrop.likelihood`, or None. A pixel in the shape has a
-    smaller weight if its colour fits the surroundings better, by the histograms `colors`: the shape may wrongly close a hole there. Pixels
-    in a band around the shape have no weight in either histogram. The shape may still lack parts of the object, and their colours must not
-    be learned as the surroundings'.
+    `prior` (H, W) is the shape's projection, and `plain` (H, W) the result of `Backdrop.likelihood`, or None. The shape may wrongly close a
+    hole. Therefore a pixel in the shape has a smaller weight if its colour fits the surroundings better (by the histograms `colors`). The
+    shape may also lack parts of the object, whose colours must not be learned as the surroundings'. Therefore pixels in a band around the
+    shape have no weight in either histogram.
     """
     ours = prior * (prior > 0.5)
     if colors is not None:
@@ -310,8 +320,9 @@ def _posterior(
 ) -> np.ndarray:
     """Return the probability that each pixel shows the object, (H, W).
 
-    Two sources are combined. One is the shape's projection `prior`. The other is the model's probability, if the photo has `salient`, or
-    else the pixel's colour: how well it fits the histograms of all photos, those of this photo, and the bare plane.
+    Two sources are combined. One is the shape's projection `prior`. The other is `salient`, the probability by a segmentation model. If the
+    photo has no `salient`, the pixel's colour is used. It is compared with three things: the histograms of all photos, the histograms of
+    this photo, and the bare plane.
     """
     evidence = _of_colors(photo, prior, plain, colors) if photo.salient is None else _of_model(photo.salient)
     odds = np.clip(prior, 0.1, 0.9)

@@ -1,9 +1,9 @@
 """Find photos that show the same part of a scene, by their image features.
 
-A photo is described by one vector (VLAD: Jégou et al. 2010; normalised as by Arandjelović and Zisserman 2013). Each feature is assigned to
-the nearest of WORDS means of all photos' features. For each mean, the vector holds the sum of the differences between its features and
-the mean. The means are made of the photos themselves, so that nothing is downloaded. A vector takes milliseconds; matching the features of
-two photos takes tenths of a second.
+A photo is described by one vector (VLAD: Jégou et al. 2010; normalised as by Arandjelović and Zisserman 2013). The features of all photos
+are clustered by k-means. Each feature of a photo is assigned to the nearest mean. For each mean, the vector holds the sum of (feature −
+mean) over the features assigned to this mean. The means are made of the photos themselves, so that nothing is downloaded. A vector takes
+milliseconds; matching the features of two photos takes tenths of a second.
 """
 
 from collections.abc import Callable
@@ -22,8 +22,8 @@ def similar_pairs(read: Callable[[int], np.ndarray], count: int, beside: int) ->
 
     `read(index)` returns the descriptors of a photo's features, (M, D) of any dtype. It is called twice for each photo. Photos whose
     indices differ by at most `beside` are not paired. For each photo, the others are sorted by likeness, the most similar first, and those
-    at the positions RANKS are taken. RANKS has gaps, because the most similar of many photos were all taken from nearby: photos from other
-    rounds around the object come later. The same photos always give the same pairs.
+    at the positions RANKS are taken. RANKS skips some positions, to reach farther down the list. The most similar photos were all taken
+    from nearby. Photos from other rounds around the object come later. The same photos always give the same pairs.
     """
     random = np.random.default_rng(0)
     sample = np.concatenate([random.permutation(read(index))[:SAMPLE] for index in range(count)])

@@ -6,10 +6,10 @@ and `dataLoader/tensoIR_relighting_test.py` in its repository). NeRFactor's data
     metadata.json       cam_transform_mat   camera to world with OpenGL's axes: 16 numbers, row by row, with commas between them
                         cam_angle_x         horizontal field of view in radians
                         imw, imh            width and height in pixels
-    rgba.png            the photo, with straight alpha. Copies of the data set name it differently: PHOTOS
+    rgba.png            the photo, with straight alpha. Some copies of the data set have another name for it: see PHOTOS
     normal.png          n/2 + 1/2, in world coordinates
     albedo.png          linear base colour
-    rgba_LIGHT.png      the view under each of the other lights in LIGHTS
+    rgba_LIGHT.png      the same view under another light, for each LIGHT in LIGHTS
 
 A light is the panorama LIGHT.hdr, in Blender's orientation. It is in `Environment_Maps`, which is beside the scene's folder or one
 folder further up. The views `val_000` … are not used.

@@ -64,7 +64,7 @@ class CaptureFiles(NamedTuple):
 class Capture:
     """Photos with cameras, in the run's frame: the world coordinates of training, with Z up.
 
-    - `to_capture` is the 4×4 float64 similarity p_capture = to_capture @ p_run. If the capture's layout is in Z_UP, it is the identity,
+    - `to_capture` is the 4×4 float64 similarity p_capture = to_capture @ p_run. If the layout's coordinates have +Z up, it is the identity,
       unless the region of interest is too far away, too large or too small for float32. Other captures are rotated, moved and scaled: Z is
       then up, and the region of interest, found without a box, has radius 1 about the origin. If the user gives an up direction, the run's
       frame is rotated to it.

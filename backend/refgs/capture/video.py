@@ -1,4 +1,4 @@
-"""Choose photos from a video: the sharpest frame of each stretch of time, where the camera moved."""
+"""Choose photos from a video: the sharpest frame of each stretch of time in which the camera moved."""
 
 import os
 import shutil
@@ -326,7 +326,7 @@ def _sharp(candidates: list[_Candidate]) -> list[_Candidate]:
 
 
 def _choose(video: Path, frames: int, candidates: list[_Candidate]) -> tuple[list[_Candidate], int, int]:
-    """Leave out blurred candidates and duplicates. Before a duplicate, the camera has not moved since the last candidate that was kept.
+    """Leave out blurred candidates and duplicates. A duplicate shows nearly the same picture as the last candidate that was kept.
 
     Returns the candidates that are left, the number of blurred ones and the number of duplicates. Raises InputError if fewer than
     MIN_PHOTOS are left. The error names `video` and the number of its `frames`.
