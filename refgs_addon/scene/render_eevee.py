@@ -30,12 +30,16 @@ def render_preview(
     exr: Path | None = None,
     engine: str = compat.EEVEE,
 ) -> None:
-    """Render a camera's view in Eevee, or another engine, over a transparent background. The default camera is the scene's.
+    """Render a camera's view over a transparent background, in Eevee or the render engine `engine`. The default camera is the scene's.
 
-    `size` is the picture's longer side in pixels; by default the picture is as large as the camera's photo. `samples` are Eevee's. `png`
-    gets 8-bit sRGB with straight alpha, through the Standard view transform. `exr` gets linear Rec.709 radiance in 32 bits, premultiplied.
-    If the OpenColorIO config has no Standard view, `png` is made by the scene's own view. If it has no Rec.709, `exr` has the config's
-    working space. The scene's own settings are restored. Raises InputError if there is no camera or a file cannot be written.
+    `size` is the picture's longer side in pixels; by default the picture is as large as the camera's photo. `samples` is the number of
+    samples in Eevee.
+    - `png` gets 8-bit sRGB with straight alpha, through the Standard view transform. If the OpenColorIO config has no Standard view, the
+      scene's own view is used.
+    - `exr` gets linear Rec.709 radiance in 32 bits, premultiplied. If the config has no Rec.709, the radiance is in the config's working
+      space.
+
+    The scene's own settings are restored. Raises InputError if there is no camera or a file cannot be written.
     """
     camera = camera or scene.camera
     if camera is None:
