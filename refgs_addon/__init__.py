@@ -2,5 +2,5 @@
 
 `scene` holds plain functions that write Blender data. `nodes` builds node trees. `ui` holds the operators and panels that call them.
 
-The package itself imports nothing, so that `python -m refgs_addon.preview` can report a missing library before it loads bpy.
+This file imports nothing. So `python -m refgs_addon.preview` can check for missing libraries before it loads bpy.
 """

@@ -1,7 +1,7 @@
-"""Store the add-on's paths in a .blend file relative to it (`//`), so that a copied project uses its own run and capture.
+"""Save the add-on's paths relative to the .blend file (`//`), so that a copied project uses its own run and capture.
 
-While a .blend is open, these paths are absolute. They are made relative before it is saved, and absolute afterwards. Blender itself does
-this for images, but not for properties.
+While a .blend is open, these paths are absolute. They are made relative before it is saved, and absolute again afterwards. Blender itself
+makes the paths of images relative, but not paths in other properties.
 """
 
 import os
@@ -16,7 +16,7 @@ from .scene.strokes import STROKES
 
 
 def _change(change: Callable[[str], str]) -> None:
-    """Replace each path that the add-on stores by `change(path)`.
+    """Apply `change` to each path that the add-on stores in the open file.
 
     Data linked from another .blend is left out, because it is not saved in this one.
     """
@@ -80,7 +80,7 @@ def _after_loading(*_) -> None:
 
 @bpy.app.handlers.persistent
 def _after_appending(context, *_) -> None:
-    """Make paths absolute in data that was appended from another .blend, where they were relative to that file.
+    """Make paths absolute in data that was appended from another .blend. In that file, they were relative to it.
 
     Paths that were in this .blend before are absolute already, and stay as they are.
     """

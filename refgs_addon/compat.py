@@ -106,9 +106,9 @@ def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
 
 
 def usd_materials() -> dict[str, str | bool]:
-    """Return arguments that let Blender's USD exporter write MaterialX beside UsdPreviewSurface, and copy no textures.
+    """Return arguments for Blender's USD exporter. With them, it writes MaterialX beside UsdPreviewSurface, and copies no textures.
 
-    The USD file then refers to the existing texture files.
+    The USD file refers to the existing texture files.
 
     Raises KeyError if Blender was built without USD, as Debian's Blender is.
     """

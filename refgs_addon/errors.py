@@ -9,5 +9,5 @@ class InputError(Exception):
 
 
 def missing_module(error: ModuleNotFoundError) -> str:
-    """Return a message that Blender's Python lacks a package. Debian's Blender may lack numpy, which is imported late."""
+    """Return a message for the artist that Blender's Python lacks a package. Debian's Blender may lack numpy."""
     return f"Blender's Python lacks {error.name}: install it (on Debian, python3-{error.name})"

@@ -38,7 +38,10 @@ NEEDED, NEEDED_WITH_CARD = 2 * GB, 7 * GB  # torch's CUDA builds include CUDA's 
 
 
 def wheel(name: str) -> Path | None:
-    """Find the wheel (Python package file) of `name` that comes with the add-on. Returns None if there is none, as in the repository."""
+    """Find the wheel (Python package file) of `name` that comes with the add-on.
+
+    Returns None if there is none. An add-on that runs from the repository has no wheels.
+    """
     return next(WHEELS.glob(f"{name}-*.whl"), None)
 
 
@@ -57,7 +60,10 @@ def installed(home: Path) -> str:
 
 
 def origin(home: Path) -> str:
-    """Return a sentence about where the installed packages came from and whether they are those of the release; "" if that is not known."""
+    """Read the installation's sentence about its packages: which hosts they came from, or that their hashes were not checked.
+
+    Returns "" if there is no such sentence.
+    """
     try:
         return (home / "origin").read_text(encoding="utf-8")
     except OSError:
@@ -75,11 +81,12 @@ def python(home: Path) -> Path:
 
 
 def needed_bytes() -> float:
-    """Estimate the disk space in bytes for the trainer.
+    """Estimate the disk space in bytes that the trainer needs. It needs more with torch's CUDA build.
 
-    A machine with nvidia-smi needs more, because it may get torch's CUDA build. On Linux, any machine needs more if the add-on has lock
-    files (lists of exact package versions), but none for torch's CPU build: torch then comes from the package index, which has only the
-    CUDA build for Linux.
+    The CUDA build is expected in two cases:
+    - The machine has nvidia-smi.
+    - On Linux, the add-on has lock files (lists of exact package versions), but none for torch's CPU build. Then torch comes from the
+      package index, which has only the CUDA build for Linux.
     """
     locked = sys.platform == "linux" and (WHEELS / "lock.txt").is_file() and not (WHEELS / "lock-cpu.txt").is_file()
     return NEEDED_WITH_CARD if locked or shutil.which("nvidia-smi") else NEEDED
@@ -218,11 +225,12 @@ def _install(home: Path, uv: Path, trainer: Path) -> None:
 
 
 def _choose_lock(program: Path, variables: dict[str, str], home: Path, locks: Path) -> Path:
-    """Return the lock file (versions and hashes of all packages) for the build of torch that uv chooses for this machine.
+    """Choose the lock file (versions and hashes of all packages) for this machine. Returns its path in the folder `locks`.
 
-    `locks` is the folder of the lock files. A build is named at the end of torch's version, such as 2.14.0+cpu. If there is a lock file for
-    that build, return it, and store the build's name in `variables` as UV_TORCH_BACKEND. Otherwise return lock.txt, which is for the
-    package index's build, and delete UV_TORCH_BACKEND from `variables`.
+    uv chooses a build of torch for the machine. The end of torch's version names it: 2.14.0+cpu is the build cpu. If there is a lock file
+    for that build, such as lock-cpu.txt, return it. UV_TORCH_BACKEND in `variables` then becomes the build's name.
+
+    Otherwise return lock.txt, for which torch comes from the package index. UV_TORCH_BACKEND is then deleted from `variables`.
     """
     lock, wanted = locks / "lock.txt", home / "torch.txt"
     if "UV_TORCH_BACKEND" not in variables or not (pinned := re.search(r"^torch==\S+", lock.read_text(), re.M)):
@@ -291,9 +299,10 @@ def _uv_environment(home: Path) -> dict[str, str]:
 
     uv downloads a Python of its own for the trainer. Blender's Python or the system's would not do, because an update may replace it.
 
-    UV_TORCH_BACKEND is "auto": uv chooses the build of torch for this machine's GPU. With some package mirrors, torch must come from the
-    package index instead. For these, the user sets UV_TORCH_BACKEND to "", and this function removes the variable. It also removes all
-    variables whose names begin with PYTHON.
+    UV_TORCH_BACKEND is "auto" by default: uv then chooses the build of torch for this machine's GPU. With some package mirrors, torch must
+    come from the package index. The user then sets UV_TORCH_BACKEND to "", and this function removes it.
+
+    Variables whose names begin with PYTHON are removed, too.
     """
     set_here = {"UV_TORCH_BACKEND": "auto", "UV_PYTHON_INSTALL_DIR": str(home / "python")}
     if not os.environ.keys() & {

@@ -56,9 +56,9 @@ def _poll_other_processes() -> float | None:
 
 
 def follow_batch(folder: Path) -> None:
-    """Start a timer that reads the table of a batch (the training of many captures), at once and then every two seconds until it ends.
+    """Start a timer that reads the table of a batch now, and then every two seconds until the batch ends.
 
-    `folder` is the folder of the batch's runs.
+    A batch is the training of many captures. `folder` is the folder of its runs.
     """
     global _batch
     _batch = folder

@@ -42,7 +42,7 @@ class Job:
     """Store the commands for one worker process, in order, and what the process has reported so far.
 
     `state` is "waiting" (for earlier jobs), "starting", "running", "paused", "done", "cancelled" or "failed". A job without commands starts
-    the worker only to learn its version.
+    the worker only to learn the trainer's version.
     """
 
     name: str
@@ -305,7 +305,7 @@ def _check(capture: Path, out: Path) -> dict:
 
 
 def query_trainer(python: Path, log: Path) -> Job:
-    """Start a job that finds the version of the trainer that the Python program `python` can import.
+    """Start a job that asks the trainer for its version and GPU. `python` is the Python program that has the trainer.
 
     When the trainer has answered, the job's `ready` has the keys `refgs` (version), `card` (the GPU's name, or None) and `no_card` (why
     there is no GPU).
@@ -342,8 +342,8 @@ class Asked:
       None, the preset is "standard".
     - `settings` overrides single settings: `{"train.iterations": 2000}`.
     - `resume` continues a stopped training.
-    - `hinted` names a finished run, and a file that says which parts of its surface are metal or paint. The training of that run is
-      continued in `out`, with the run's preset and settings.
+    - `hinted` is a pair: the folder of a finished run, and a file that says which parts of the object are metal or paint. The job then
+      continues that run's training in `out`, with that run's preset and settings.
     """
 
     capture: Path
@@ -415,8 +415,8 @@ def display_splats(python: Path, run: Path, file: Path, log: Path) -> Job:
 def in_blender(name: str, blender: Path, arguments: tuple[str, ...], command: Mapping[str, object], log: Path) -> Job:
     """Start a job in another Blender process, which runs `render_worker`. It does not wait for other jobs.
 
-    `arguments` are the command-line arguments of that Blender. `command` is the dictionary that `render_worker` then reads from stdin: what
-    to do. A finished job's `results["render"]["png"]` is the path of the picture, if it rendered one.
+    `arguments` are the command-line arguments of that Blender. `command` is one of the commands that `render_worker` lists. If the job
+    renders a picture, the finished job's `results["render"]["png"]` is the picture's path.
     """
     return _add(Job(name, blender, [dict(command)], log, arguments=arguments, program=BLENDER))
 

@@ -34,8 +34,7 @@ def open_file(path: Path) -> BinaryIO:
 def read_text(path: Path) -> str:
     """Read a UTF-8 text file.
 
-    Raises OSError if it cannot be read, is not a regular file, or is empty. Raises ValueError if it is not UTF-8, or has more than LARGEST
-    bytes.
+    Raises OSError if it cannot be read, is not a regular file, or is empty. Raises ValueError if it is not UTF-8, or larger than 64 MiB.
     """
     with open_file(path) as file:
         data = file.read(LARGEST + 1)
@@ -45,10 +44,10 @@ def read_text(path: Path) -> str:
 
 
 def check_gltf(path: Path) -> None:
-    """Raise InputError if a glTF file refers to files outside its folder. Blender's importer would open them, wherever they are.
+    """Raise InputError if a glTF file, binary or text, refers to files outside its folder. Blender's importer would open such files.
 
-    A URI in the file, which is binary or text, may hold data, or be a relative path without "..". Also raises InputError if the file is
-    broken, or if a file that it refers to is missing or empty.
+    A URI in the file may contain data, or be a relative path without "..". Also raises InputError if the file is broken, or if a file that
+    it refers to is missing or empty.
     """
     try:
         with open_file(path) as file:

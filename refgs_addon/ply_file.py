@@ -28,10 +28,10 @@ Element = tuple[str, int, list[Property]]
 
 
 def read_rows(path: Path) -> np.ndarray:
-    """Read the element `vertex` of a PLY file as a structured array of little-endian numbers. Lists are left out.
+    """Read the element `vertex` of a PLY file as a structured array of little-endian numbers. List properties are left out.
 
-    The file may be text, or binary of either byte order. Raises InputError for a file that is broken, truncated, longer than its header
-    says, or without that element.
+    The file may be text, or binary of either byte order. Raises InputError if the file has no element `vertex`, or is broken, truncated or
+    longer than its header says.
     """
     lines, start = read_header(path)
     order, elements = _parse(lines, path)
@@ -107,8 +107,8 @@ def _parse(lines: list[list[str]], path: Path) -> tuple[str, list[Element]]:
 def _check_size(file: BinaryIO, order: str, elements: list[Element], path: Path) -> None:
     """Raise InputError if a file is truncated, or has more rows than its header says. Call this before memory is reserved for the rows.
 
-    `order` is the byte order, "" for text. The header does not say how long lists are. So a list counts only with the bytes of its length,
-    and a binary file with lists is not checked for surplus rows.
+    `order` is the byte order, "" for text. The header does not say how long lists are. So this check treats all lists as empty, and does
+    not look for surplus rows in a binary file with lists.
     """
     start = file.tell()
     there, need, last = os.fstat(file.fileno()).st_size - start, 0, 0

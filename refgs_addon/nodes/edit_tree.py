@@ -149,8 +149,8 @@ def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.N
 def mesh_edits_tree() -> bpy.types.NodeTree:
     """Make the node tree `RefGS Follow`, or return the existing one. It makes a mesh show the edits of the splats' materials.
 
-    Each vertex gets the edits of the splat nearest to it. Distances are measured in the local coordinates of the mesh and of the splats. So
-    it does not matter where the two objects stand.
+    Each vertex gets the edits of the splat nearest to it. Distances are between their positions in local coordinates. So the two objects
+    need not stand in the same place.
     """
     if MESH_EDITS in bpy.data.node_groups:
         return bpy.data.node_groups[MESH_EDITS]

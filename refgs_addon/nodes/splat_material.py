@@ -16,8 +16,8 @@ _SURFACE = {"metallic": "Metallic", "roughness": "Roughness", "specular": SPECUL
 def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material:
     """Make a Principled material for the quads of `nodes.splats_tree`. It reads each splat's base colour, metallic and roughness.
 
-    `constants` may have the keys "metallic", "roughness" and "specular". Such a value holds for all splats, and the material does not read
-    that value from each splat.
+    `constants` maps "metallic", "roughness" or "specular" to one value for all splats. The material then uses this value, and not the
+    splats' own.
 
     The back of a splat is black, like the inside of a solid. A lit back would shine through the small gaps between the front splats.
     """

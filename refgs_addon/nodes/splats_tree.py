@@ -27,9 +27,9 @@ def splats_tree(values_material: bpy.types.Material) -> bpy.types.NodeTree:
     """Make the node tree `RefGS Splats`, or return the existing one, which all runs share. It draws each point as a quad.
 
     The tree reads these attributes of the points: scale (standard deviations along two axes), rotation (quaternion), opacity 0..1, and
-    base_color, roughness, metallic and normal. Points may also have doubt (0..1: how little the photos tell metal from paint). The quads
-    keep all attributes of their points. They get one more, `gaussian`: the position on the splat in standard deviations. Quads are
-    realised, because Eevee draws them several times faster than instances.
+    base_color, roughness, metallic and normal. Points may also have doubt, 0..1: it is 1 where the photos do not show whether the surface
+    is metal or paint. The quads keep all attributes of their points. They get one more, `gaussian`: the position on the splat in standard
+    deviations. Quads are realised, because Eevee draws them several times faster than instances.
 
     The input Display selects what is shown. "Shaded" uses the splats' own material. Every other choice copies one attribute to `display`,
     and uses `values_material` to show it without lighting. "Doubt" is black if the points have no such attribute.

@@ -2,8 +2,8 @@
 
 For diffuse surfaces, Eevee keeps only the first two bands (degrees 0 and 1) of spherical harmonics of the world's light. It weakens the
 second band if the sum of both could be negative. So the bright side of an object is up to a third too dark, and its dark side is too
-bright. The group multiplies the base colour by the true irradiance divided by Eevee's. Three bands give the true irradiance to a percent
-(Ramamoorthi and Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps").
+bright. The group multiplies the base colour by the true irradiance, and divides it by Eevee's. Three bands give the true irradiance within
+1 % (Ramamoorthi and Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps").
 """
 
 from collections.abc import Sequence
@@ -94,11 +94,11 @@ def _switch_off_elsewhere(value: bpy.types.NodeSocket) -> None:
 
 
 def set_harmonics(tree: bpy.types.ShaderNodeTree, harmonics: Sequence[Sequence[float]], window: float) -> None:
-    """Set the world's light in the node group `tree`. `harmonics` are nine coefficients (9, 3) of the irradiance over π.
+    """Set the world's light in the node group `tree`.
 
-    They are in Blender's working space, because Eevee works in that space, too, and the group divides and limits each channel.
-    Their order is 1; x, y, z; xy, yz, 3z² − 1, xz, x² − y². This function multiplies them by the harmonics' constants, BANDS and THIRD.
-    `window` is the factor by which Eevee weakens the second band: x, y, z.
+    `harmonics` (9, 3) are spherical-harmonic coefficients of the irradiance over π, in Blender's working space, as Eevee's are. They belong
+    to the polynomials 1; x, y, z; xy, yz, 3z² − 1, xz, x² − y². This function multiplies each coefficient by the constant that normalises
+    its harmonic. `window` is the factor by which Eevee weakens the coefficients of x, y and z.
     """
     constants = (BANDS[0], *[BANDS[1]] * 3, *THIRD)
     for number, (rgb, constant) in enumerate(zip(harmonics, constants, strict=True)):
@@ -130,8 +130,10 @@ def add_world_diffuse(material: bpy.types.Material, occlusion: bpy.types.NodeSoc
 def surface_inputs(material: bpy.types.Material) -> dict[str, list[bpy.types.NodeSocket]]:
     """Find the sockets that take a material's base colour, metallic and roughness.
 
-    Returns lists of sockets under the names of the Principled BSDF's inputs, such as "Base Color". If the material has the group `RefGS
-    World Diffuse`, the group's Base Color replaces that of the BSDF, and its Metallic is listed after that of the BSDF.
+    Returns {name: sockets} with the names of the Principled BSDF's inputs, such as "Base Color". Each list has that input of the BSDF. If
+    the material has the group `RefGS World Diffuse`, two lists differ:
+    - The list "Base Color" has the group's input instead.
+    - The list "Metallic" has the group's input, too, after the BSDF's.
     """
     shader, node = principled(material), material.node_tree.nodes.get(NAME)
     found = {name: [shader.inputs[name]] for name in ("Base Color", "Metallic", "Roughness")}

@@ -61,7 +61,7 @@ def write_asset(run: Path, picture: Path | None, file: Path) -> None:
     """Import a run folder and write it as an asset into a .blend file. This first replaces the open file by an empty one.
 
     The asset is the run's collection, without its cameras and light. `picture` becomes its preview. Raises InputError if the run cannot be
-    read or the file not be written.
+    read, or the .blend file cannot be written.
     """
     from .import_run import import_run
     from .run_parts import cameras

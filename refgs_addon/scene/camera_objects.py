@@ -43,9 +43,10 @@ def read_cameras(path: Path, capture: Path | None) -> list[dict]:
 
 
 def light_of(path: Path) -> str:
-    """Read from cameras.json for which view the recovered light is right. Returns the view's name, or "" if it is right for all views.
+    """Read the name of the view that the recovered light belongs to. Returns "" if the light is right for all views.
 
-    A light that turned with the camera had another rotation in each photo. The run's panorama is then right only for the named view.
+    `path` is the file cameras.json. If the light turned with the camera, it had another rotation in each photo. The run's panorama is then
+    right only for the named view.
     """
     found = read_json(path)
     name = found.get("light_of", "") if isinstance(found, dict) else ""

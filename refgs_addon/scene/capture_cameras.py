@@ -49,9 +49,9 @@ def remove_cameras(scene: bpy.types.Scene, capture: Path) -> None:
 def replace_cameras(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bpy.types.Object]) -> None:
     """Replace the cameras that `show_cameras` added for a capture by the cameras of an imported run.
 
-    `cameras` maps names to the run's camera objects. The capture's cameras are removed, and each run camera gets its name from `cameras`.
-    If the scene looked through a removed camera, it looks through the run's camera of the same photo instead. Does nothing if
-    `show_cameras` added none.
+    `cameras` has the run's camera objects by name. The capture's cameras are removed, and the run's cameras get these names. If the scene
+    looked through a removed camera, it looks through the run's camera of the same photo instead. Does nothing if `show_cameras` added no
+    cameras for the capture.
     """
     known = cameras_of(scene, capture)
     if known is None:
@@ -66,9 +66,14 @@ def replace_cameras(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bp
 
 
 def active_cameras(context: bpy.types.Context) -> bpy.types.Collection | None:
-    """Find the collection through which the buttons "next camera" and "previous camera" step: that of a run or of a capture.
+    """Find the collection with the cameras for the buttons "next camera" and "previous camera".
 
-    The first match counts: the collection with the active object, the one with the scene's camera, the newest run, the newest capture.
+    It is the collection of a run or of a capture: the first that exists in this order.
+    1. The collection with the active object.
+    2. The newest run or a capture, if the scene's camera is in it.
+    3. The newest run.
+    4. The newest capture.
+
     Returns None if there is no run and no capture.
     """
     captures = _captures(context.scene)

@@ -1,4 +1,4 @@
-"""Read the decisions of a run: which optional parts of the training, such as specular reflection, it kept or left out.
+"""Read the decisions of a training. A decision says whether an optional part, such as specular reflection, was kept or left out.
 
 Each decision has pictures rendered with and without the part. The artist can confirm a decision, or train again with the opposite one
 (`training.train_other_way`).
@@ -17,7 +17,7 @@ ON_OFF = ("on", "off")  # words of the trainer's settings [needs]
 
 @dataclass(frozen=True)
 class Decision:
-    """Hold a decision about an optional part of the training, such as specular reflection, from a run's needs.json.
+    """Hold one decision of a training: whether an optional part, such as specular reflection, was kept. It is an entry of needs.json.
 
     `need` is the part's name in the trainer's settings, `what` its name in words. `needed` says whether the part was kept, and `why` gives
     the reason. `pictures` maps "on" (rendered with the part), "off" (without it) and "photo" to files. All three show the view `view`.

@@ -1,4 +1,4 @@
-"""Colour a run by its doubt, 0..1: how little the photos tell metal from paint."""
+"""Colour a run by its doubt: 0 where the photos show whether the surface is metal or paint, and 1 where they do not."""
 
 from pathlib import Path
 
@@ -14,17 +14,20 @@ DISPLAY = "Doubt"  # of the splats' modifier
 
 
 def has_doubt(collection: bpy.types.Collection) -> bool:
-    """Tell whether a run's splats have the attribute `doubt`, 0..1: how little the photos tell metal from paint."""
+    """Return True if a run's splats have the attribute `doubt`, 0..1.
+
+    Doubt is 1 where the photos do not show whether the surface is metal or paint.
+    """
     return any("doubt" in splats.data.attributes for splats in parts(collection).get("splats", []))
 
 
 def doubt_words(collection: bpy.types.Collection) -> str:
-    """Return the trainer's sentence on how much of a run's surface could be metal as well as paint. Return "" if the run has none."""
+    """Return the trainer's sentence on how much of a run's surface could be metal or paint. Return "" if there is no such sentence."""
     return collection.get(DOUBT, "")
 
 
 def doubt_shown(collection: bpy.types.Collection) -> bool:
-    """Tell whether `show_doubt` has coloured the splats or the mesh, whichever of the two the run shows."""
+    """Return True if a run is coloured by its doubt (see `show_doubt`). Only the shown part of the run counts: the splats or the mesh."""
     found = parts(collection)
     if shown(collection) == "mesh":
         return any(NAME in mesh.modifiers for mesh in found.get("mesh", []))
@@ -35,8 +38,8 @@ def doubt_shown(collection: bpy.types.Collection) -> bool:
 def show_doubt(collection: bpy.types.Collection, on: bool) -> None:
     """Colour a run's splats and mesh by their doubt, without lighting. If `on` is false, show them shaded again.
 
-    A surface is orange where photos do not tell metal from paint, and grey where they do. The mesh's colours come from the file
-    textures/doubt.png in the run folder. Raises InputError if the mesh is shown and this file is missing.
+    A surface is orange where the photos do not show whether it is metal or paint, and grey where they do. The mesh's colours come from the
+    file textures/doubt.png in the run folder. Raises InputError if the mesh is shown and this file is missing.
     """
     from .export_run import run_folder  # needs numpy, which Debian's Blender may lack
     from .mesh_exchange import TEXTURES

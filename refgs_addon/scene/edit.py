@@ -16,12 +16,13 @@ from .run_parts import parts, stand_with
 def add_edit(
     collection: bpy.types.Collection, where: str = "Everywhere", material: str = "Gold"
 ) -> bpy.types.NodesModifier:
-    """Add an edit, a modifier that changes the splats' materials, after the earlier edits of a run. The mesh shows the edit too.
+    """Add an edit after the earlier edits of a run. An edit is a modifier that changes the splats' materials. The mesh shows the edit too.
 
-    `collection` is the run's. `where` selects the splats, as in `nodes.edit_tree`: "Everywhere", "Box", "Sphere", "Similar" or "Painted".
-    "Box", "Sphere" and "Similar" get an Empty in the middle of the splats, which the artist moves, rotates and scales. "Painted" gets an
-    object with the shape of the mesh, on which the artist paints. `material` is the name of a material preset. Raises InputError if the
-    collection has no splats, if it has no mesh for "Painted", or if the preset is missing or invalid.
+    `collection` is the collection of the run. `where` selects the splats, as in `nodes.edit_tree`: "Everywhere", "Box", "Sphere", "Similar"
+    or "Painted". "Box", "Sphere" and "Similar" get an Empty in the middle of the splats, which the artist moves, rotates and scales.
+    "Painted" gets an object with the shape of the mesh, on which the artist paints. `material` is the name of a material preset.
+
+    Raises InputError if the collection has no splats, or if the preset is missing or invalid. "Painted" also needs a mesh.
     """
     if where not in REGIONS:
         raise InputError(f"there is no region {where}: choose one of {', '.join(REGIONS)}")
@@ -53,7 +54,7 @@ def edits(splats: bpy.types.Object) -> list[bpy.types.NodesModifier]:
 
 
 def is_edited(splats: bpy.types.Object) -> bool:
-    """Tell whether materials of the splats were edited, or splats deleted."""
+    """Return True if the splats have an edit of their materials, or if any splat was deleted."""
     return bool(edits(splats)) or count_deleted(splats) > 0
 
 

@@ -55,12 +55,13 @@ def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
 
 
 def export_splats(collection: bpy.types.Collection, path: Path) -> None:
-    """Write the splats of a run that were not deleted, with the edits of their materials, as a splats.ply.
+    """Write a run's splats with their edited materials as a splats.ply. Deleted splats are left out.
 
-    The new file is a copy of the run's file without deleted splats and with the edited materials. Each splat also has a fixed colour
-    (f_dc), for viewers without lights. Where an edit changes the base colour, the fixed colour changes by the same factor. Raises
-    InputError if the run's file is missing, has changed or has no materials, if all splats are deleted, or if the new file cannot be
-    written.
+    Each splat also has a fixed colour (f_dc), for viewers without lights. Where an edit changes the base colour, the fixed colour changes
+    by the same factor.
+
+    Raises InputError if the run's splats.ply is missing, has changed since the import or has no materials. Also raises it if all splats are
+    deleted, or if the new file cannot be written.
     """
     splats = splats_of(collection)
     source = run_folder(collection) / "splats.ply"

@@ -52,7 +52,7 @@ def chosen_part(splats: bpy.types.Object, active: bpy.types.Object | None) -> np
 
 
 def part_at(splats: bpy.types.Object, origin: Vector, direction: Vector) -> np.ndarray:
-    """Return the positions (P, 3), in the splats' coordinates, of all splats that belong to the part of the surface that a ray hits first.
+    """Find the part of the surface that a ray hits first. Returns the positions (P, 3) of that part's splats, in the splats' coordinates.
 
     A part is a piece of the surface without creases. Changes of the trained material do not end a part, because that material may be wrong.
     `origin` and `direction` of the ray are in world space. Raises InputError if the ray hits no splat.
@@ -102,7 +102,7 @@ def _smooth_part(splats: bpy.types.Object, seed: int) -> np.ndarray:
     """Find the splats that a surface without creases connects to the splat with the index `seed`. Returns a mask (N,).
 
     Neighbours are connected if their normals agree, and if the line between them runs along the surface. A splat is also selected if most
-    of its neighbours are. A faint splat is selected if the nearest solid splat is.
+    of its neighbours are selected. A splat with an opacity below 0.2 is selected if the nearest splat above 0.2 is selected.
     """
     position, normal = (_attribute(splats, name, "vector", 3) for name in ("position", "normal"))
     solid = _attribute(splats, "opacity", "value", 1)[:, 0] >= SOLID

@@ -131,7 +131,7 @@ def put_under(meshes: list[bpy.types.Object], splats: bpy.types.Object) -> None:
 
 
 def trace_rays(scene: bpy.types.Scene) -> None:
-    """Set up a scene's render engines for a run: ray tracing in Eevee, and at least LAYERS transparent bounces in Cycles.
+    """Set up a scene's render engines for a run: ray tracing in Eevee, and at least 64 transparent bounces in Cycles.
 
     With ray tracing, Eevee also shows the object's reflections and shadows on itself. Rays are traced at full resolution and not denoised,
     because half the resolution and Blender's denoising both make chrome and glossy paint look dull. If ray tracing is already on, its
@@ -186,7 +186,10 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
 
 
 def _doubt_words(folder: Path) -> str:
-    """Read from a run's metrics.json the text that says where photos do not tell metal from paint. Returns "" if there is no such text."""
+    """Read the trainer's sentence on how much of a run's surface could be metal or paint.
+
+    It is in the run's metrics.json. Returns "" if there is no such sentence.
+    """
     try:
         return str(read_json(folder / "metrics.json")["doubt"]["what"])
     except (InputError, KeyError, TypeError):  # not there, of an older release, or half copied
@@ -194,9 +197,9 @@ def _doubt_words(folder: Path) -> str:
 
 
 def _occlusion(material: bpy.types.Material) -> bpy.types.NodeSocket | None:
-    """Find the output socket with the ambient occlusion in a material that Blender's glTF importer made. Returns None if it has none.
+    """Find the output socket with the ambient occlusion in a material that Blender's glTF importer made.
 
-    The importer links this output to a group node that Blender does not render.
+    The importer links this output to a group node that Blender does not render. Returns None if the material has no ambient occlusion.
     """
     inputs = (node.inputs.get("Occlusion") for node in material.node_tree.nodes if node.type == "GROUP")
     return next((socket.links[0].from_socket for socket in inputs if socket and socket.links), None)

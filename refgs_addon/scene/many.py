@@ -11,9 +11,9 @@ from ..preferences import log_file, python
 
 
 def results_folder(scene: bpy.types.Scene) -> Path | None:
-    """Return the folder for the runs: the artist's choice, or else one beside the folder of captures.
+    """Return the folder for the runs. If the artist has chosen none, it is a folder beside the folder of captures.
 
-    Returns None if the artist has chosen neither.
+    Returns None if the artist has chosen no folder of captures either.
     """
     settings = scene.refgs.many
     if settings.results:

@@ -33,8 +33,8 @@ PACKED = {
 def write_mesh(mesh: Path, path: Path, engine: str = "Any Program") -> None:
     """Convert a run's mesh.glb to the .usdc or .fbx file `path`. Copy the run's textures to the folder `NAME textures` beside that file.
 
-    `engine` is a key of PACKED and selects extra textures for a game engine, which are written to the same folder. The open .blend does
-    not change. Raises InputError if a texture is missing, or if a file cannot be read or written.
+    `engine` is the game engine for which extra textures are written to the same folder: "Unreal", "Unity", or "Any Program" for none. The
+    open .blend does not change. Raises InputError if a texture is missing, or if a file cannot be read or written.
     """
     sources = {name: mesh.parent / TEXTURES / f"{name}.png" for name in (*_PICTURES, "occlusion")}
     for source in sources.values():
@@ -78,7 +78,7 @@ def _specular(item: bpy.types.Object) -> float:
 def _material(name: str, folder: Path, specular: float) -> bpy.types.Material:
     """Make a Principled BSDF material that reads each input from its own texture.
 
-    Two inputs cannot share the channels of one texture: FBX cannot select a channel, and both exporters ignore the nodes that could.
+    No input takes a single channel of a texture: FBX cannot select a channel, and both exporters ignore the nodes that could.
     """
     material = bpy.data.materials.new(name)
     tree, inputs = node_tree(material), {SPECULAR: specular}

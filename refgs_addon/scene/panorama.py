@@ -38,16 +38,18 @@ def best_rotation(image: bpy.types.Image, other: bpy.types.Image) -> tuple[float
 
 
 def diffuse_light(image: bpy.types.Image, rotation: Sequence[float]) -> tuple[np.ndarray, float]:
-    """Compute a panorama's diffuse light, and the factor by which Eevee weakens harmonics of degree 1 under this panorama.
+    """Compute a panorama's diffuse light, and the factor by which Eevee weakens the panorama's harmonics of degree 1.
 
     The diffuse light is the irradiance over π, as coefficients of nine spherical harmonics (9, 3), for `nodes.world_diffuse.set_harmonics`.
     It is in Blender's working space, as Eevee's own light is. `rotation` rotates the environment: Euler angles in radians.
 
     For diffuse light, Eevee uses only the harmonics of degree 0 and 1. It multiplies the coefficients of degree 1 by the factor. The factor
-    is at most 1, and the same for red, green and blue: the smallest that one of them needs. Let c be the coefficient of degree 0 of the
-    radiance, and v the vector of the three coefficients of degree 1. Until Blender 5.0, the factor limits each component of v to BANDS[0] /
-    BANDS[1] · c. From 5.1 on, it limits the length of v to 0.75 · c. The factor computed here is right to 0.02, as measured on spheres in
-    4.3, 4.5, 5.0, 5.1, 5.2 and 5.3, under five panoramas each.
+    is 1 if they are within a limit. Otherwise it is the largest one that brings red, green and blue within the limit. Let c be the
+    coefficient of degree 0 of the radiance in one of these colours, and v the vector of the three coefficients of degree 1.
+    - Until Blender 5.0, no component of v may exceed c / √3.
+    - From 5.1 on, the length of v may not exceed 0.75 · c.
+
+    On spheres in 4.3, 4.5, 5.0, 5.1, 5.2 and 5.3, under five panoramas each, the computed factor was right to 0.02.
     """
     light = _reduced(image)
     height, azimuth = (

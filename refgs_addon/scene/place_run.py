@@ -13,7 +13,7 @@ Box = tuple[Vector, Vector]  # lowest and highest corner, in world space
 
 
 def extent(splats: bpy.types.Object, meshes: list[bpy.types.Object]) -> Box:
-    """Return the box around the mesh of a run that was not moved after its import. Without a mesh, the box is around most of its splats."""
+    """Return the box around a run's mesh. Without a mesh, return the box around most of its splats. Call this before the run is moved."""
     solid = [item for item in meshes if item.data.polygons]
     return _box(solid) if solid else bounds(splats.data)
 
@@ -21,8 +21,8 @@ def extent(splats: bpy.types.Object, meshes: list[bpy.types.Object]) -> Box:
 def put_beside(collection: bpy.types.Collection, layer: bpy.types.ViewLayer) -> bpy.types.Object | None:
     """Move an imported run along x until it overlaps no other visible mesh object, such as Blender's default cube.
 
-    Call this right after the import. Returns the object that the run now stands beside, or None if the run was not moved. An object with at
-    least LARGE times the run's longest side counts as a room: the run may stand in it.
+    Call this right after the import. Returns the object that the run now stands beside, or None if the run was not moved. Objects at least
+    four times as long as the run count as rooms, in which the run may stand.
     """
     layer.update()
     low, high = extent(parts(collection)["splats"][0], parts(collection).get("mesh", []))

@@ -66,12 +66,13 @@ def training_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
 
 
 def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Show the training box, which limits the training: only what is inside is trained. Make the box if there is none.
+    """Show the training box, and make it if there is none. Only what is inside this box is trained.
 
-    A box that was only guessed from the cameras counts as placed by the artist from now on. The check of a capture finds the sphere that
-    the cameras look at. A new box encloses this sphere. If the capture was not checked, the new box is 2 m wide around the origin. That is
-    right for most captures: the trainer turns, moves and scales the cameras so that the sphere has its centre at the origin and a radius of
-    1 m. Captures from NeRF-Blender usually keep their cameras unchanged.
+    If the box was only guessed from the cameras, it counts as placed by the artist from now on. A new box encloses the sphere that the
+    cameras look at, as the check of the capture found it.
+
+    If the capture was not checked, the new box is 2 m wide around the origin. This suits most captures: the trainer turns, moves and scales
+    the cameras so that the sphere fits this box. Captures from NeRF-Blender usually keep their cameras unchanged.
     """
     box = training_region(scene)
     if box is None:
@@ -143,7 +144,7 @@ def _new_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def _world_matrix(scene: bpy.types.Scene, box: bpy.types.Object) -> Matrix:
-    """Return an object's present matrix from local to world coordinates, even if it was moved or hidden just before."""
+    """Return the matrix from an object's local coordinates to world space. It is up to date even if the object was just moved or hidden."""
     hidden, box.hide_viewport = box.hide_viewport, False  # Blender does not evaluate hidden objects
     for layer in scene.view_layers:
         layer.update()

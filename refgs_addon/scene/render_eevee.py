@@ -30,12 +30,15 @@ def render_preview(
     exr: Path | None = None,
     engine: str = compat.EEVEE,
 ) -> None:
-    """Render a camera's view in Eevee, or another engine, over a transparent background. The default camera is the scene's.
+    """Render a camera's view over a transparent background, in Eevee or the render engine `engine`. The default camera is the scene's.
 
-    `size` is the picture's longer side in pixels; by default the picture is as large as the camera's photo. `samples` are Eevee's. `png`
-    gets 8-bit sRGB with straight alpha, through the Standard view transform. If the OpenColorIO config has no such view, it is the scene's
-    own view. `exr` gets radiance in 32 bits, premultiplied, in the space that Blender gives float pictures: by default linear Rec.709. The
-    scene's own settings are restored. Raises InputError if there is no camera or a file cannot be written.
+    `size` is the picture's longer side in pixels; by default the picture is as large as the camera's photo. `samples` is the number of
+    samples in Eevee.
+    - `png` gets 8-bit sRGB with straight alpha, through the Standard view transform. If the OpenColorIO config has no Standard view, the
+      scene's own view is used.
+    - `exr` gets radiance in 32 bits, premultiplied, in the space that Blender gives float pictures: by default linear Rec.709.
+
+    The scene's own settings are restored. Raises InputError if there is no camera or a file cannot be written.
     """
     camera = camera or scene.camera
     if camera is None:

@@ -97,10 +97,10 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
     - rotation (N, 4), unit quaternions wxyz;
     - opacity, metallic and roughness (N,), all 0..1;
     - base_color (N, 3), linear Rec.709;
-    - doubt (N,), 0..1, only if the file has it: how little photos tell metal from paint.
+    - doubt (N,), 0..1, only if the file has it: 1 where the photos do not show whether the surface is metal or paint.
 
-    Splats without materials become matte; their base colour is that of their constant spherical harmonic. Splats without normals get their
-    shortest axis as normal. Raises InputError for any other file.
+    Splats without materials become matte. Their base colour comes from f_dc, the constant spherical harmonic. Splats without normals get
+    their shortest axis as normal. Raises InputError for any other file.
     """
     all_rows = read_rows(path)
     if "packed_position" in all_rows.dtype.names:
@@ -188,7 +188,7 @@ def _flatten_gaussians(rotation: np.ndarray, scale: np.ndarray) -> tuple[np.ndar
 def finite_rows(rows: np.ndarray) -> np.ndarray:
     """Return the rows of a PLY in which all values of the splat are finite. The trainer selects the same rows.
 
-    Logits may be infinite. Opacity is a logit, and so are Ref-Gaussian's materials: infinity stands for exactly 0 or 1. Columns that no
+    Only logits may be infinite, which stands for exactly 0 or 1. Opacity is a logit, and so are Ref-Gaussian's materials. Columns that no
     splat needs are not checked.
     """
     names = [name for name in rows.dtype.names if _SPLATS.fullmatch(name)]
@@ -211,8 +211,8 @@ def finite_rows(rows: np.ndarray) -> np.ndarray:
 def read_constants(path: Path) -> dict[str, float]:
     """Read the values that all splats of a splats.ply share: "metallic", "roughness" or "specular". Returns them by name.
 
-    They are comments in the file's header, and are ignored if the file also has a column of that name. Specular is the Principled BSDF's
-    Specular IOR Level. Raises InputError if the file cannot be read, or a value is not a number.
+    The values are comments in the file's header. A value is ignored if the file also has a column of its name. Specular is the Principled
+    BSDF's Specular IOR Level. Raises InputError if the file cannot be read, or a value is not a number.
     """
     lines = read_header(path)[0]
     columns = {line[2] for line in lines if line[:1] == ["property"] and len(line) == 3}
@@ -288,10 +288,13 @@ def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
 
 
 def _morton_order(position: np.ndarray, shift: float) -> np.ndarray:
-    """Sort points (N, 3) along a Morton curve through their bounding cube. Returns their indices in that order.
+    """Sort points (N, 3) along a Morton curve. Returns their indices in that order.
 
-    Points that lie close together can be far apart along one curve. Along a second curve they are likely to be close: `shift` moves the
-    curve by this fraction of the cube's side.
+    The curve fills a cube whose side is twice that of the points' bounding cube. `shift` moves the points in the larger cube, by a fraction
+    of its side.
+
+    Points that lie close together can be far apart along one curve. Along a second curve, with another `shift`, they are likely to be
+    close.
     """
     low = position.min(axis=0)
     cells = (position - low) / max((position - low).max(), 1e-30) / 2 + np.float32(shift)

@@ -94,7 +94,7 @@ def make_masks(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def _show_masks(number: int, capture: Path, found: dict) -> None:
-    """Show masks that the trainer has just made: on the canvases for strokes, and by the training box.
+    """Show the masks that the trainer has just made, on the canvases for strokes. Also move the training box.
 
     The coordinate frame of a training depends on the masks. A box that the artist placed moves with the frame, so that it stays around the
     object. Otherwise the box moves to where the trainer found the object. `found` is the trainer's result: `region` has the settings of the
@@ -122,9 +122,10 @@ def save_strokes(scene: bpy.types.Scene) -> jobs.Job:
 def train_other_way(scene: bpy.types.Scene, folder: Path, need: str) -> jobs.Job:
     """Start a job that trains like `train`, but with the opposite of one decision that the run in `folder` made.
 
-    The decision was about the optional part `need` of the training: kept or left out (see `decisions`). The result goes into a new folder
-    beside that run. If the scene's settings have a property for this part, it is set to the new answer. Raises InputError as `train` does,
-    if the run has no such decision, or if it was trained on another capture than the scene's.
+    The decision is whether the optional part `need` of the training is kept (see `decisions`). The result goes into a new folder beside
+    that run. If the scene's settings have a property for this part, it is set to the new answer.
+
+    Raises InputError as `train` does. Also raises it if the run has no such decision, or was trained on another capture than the scene's.
     """
     decision, settings, trained = find_decision(folder, need), scene.refgs, _trained_capture(scene, folder)
     if trained is not None and trained.resolve() != _capture(scene).resolve():
@@ -143,8 +144,8 @@ def train_with_hint(
     """Start a job that repeats most of a run's training, and keeps a part of the surface metal or paint. `kind` is "metal" or "paint".
 
     The part is what the artist has chosen (`hints.chosen_part`). If nothing is chosen, it is the part that `ray` hits, a pair of origin and
-    direction in world space. The result goes into a new folder beside the run. Raises InputError if there is no trainer or no part, or if
-    the run's folder has no checkpoint or its capture is missing.
+    direction in world space. The result goes into a new folder beside the run. Raises InputError if one of these is missing: the trainer,
+    the part, the run's checkpoint or its capture.
     """
     from .edit import splats_of
     from .export_run import run_folder
@@ -223,7 +224,7 @@ def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.
     """Start a job in which the trainer writes a run with its edits as display splats, for viewers without lights.
 
     Display splats have fixed colours: how the run looks under the light recovered from the photos. An existing file is replaced. Raises
-    InputError if there is no trainer, or the run or the file's folder does not exist.
+    InputError if the trainer, the run folder or the folder for the file is missing.
     """
     from .edit import is_edited, splats_of
     from .export_run import export_run, run_folder

@@ -64,10 +64,10 @@ def relight(scene: bpy.types.Scene, hdri: Path | None, rotation: float = 0.0, st
 
 
 def match_light(scene: bpy.types.Scene) -> None:
-    """Rotate and scale the scene's HDRI until it matches the light recovered from the run's photos.
+    """Rotate the scene's HDRI and change its strength, to match the light recovered from the run's photos.
 
-    The rotation is matched by log luminance, the scale by the mean radiance over the sphere. Raises InputError if the scene has no
-    recovered light, or already uses it.
+    The rotation is the one at which the log luminances agree best. The strength makes the mean luminances over the sphere equal. Raises
+    InputError if the scene has no recovered light, or is lit by that light already.
     """
     world = scene.world
     if not is_panorama(world) or world.get(RECOVERED) is None:

@@ -30,7 +30,7 @@ class _Export(OnRun, ExportHelper):
         return {"RUNNING_MODAL"}
 
     def chosen(self) -> dict[str, str]:
-        """Return what the artist chose besides the file, as arguments of the function that writes it."""
+        """Return the artist's choices other than the file, as keyword arguments of the function that writes the file."""
         return {}
 
     def work(self, context: bpy.types.Context) -> None:

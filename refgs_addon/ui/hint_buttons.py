@@ -68,8 +68,8 @@ class Hint(OnRun, bpy.types.Operator):
 def clicked_ray(screen: bpy.types.Screen, x: int, y: int) -> tuple[Vector, Vector] | None:
     """Return the ray through a pixel of a 3D view, as origin and direction in world space.
 
-    `x` and `y` count pixels from the lower left corner of the window. Returns None if the pixel is in no 3D view, or in its header or
-    sidebar.
+    `x` and `y` count pixels from the lower left corner of the window. Returns None if the pixel is not in a 3D view, or is in a 3D view's
+    header or sidebar.
     """
     regions = [region for area in screen.areas if area.type == "VIEW_3D" for region in area.regions]
     there = [r for r in regions if r.x <= x < r.x + r.width and r.y <= y < r.y + r.height]

@@ -73,8 +73,8 @@ def curve_icon(job: jobs.Job) -> int:
 def plot(trained: list[tuple[float, float]], held_out: list[tuple[float, float]]) -> "np.ndarray":
     """Plot PSNR over log time. Returns RGBA pixels (height, width, 4), bottom row first.
 
-    `trained` and `held_out` are points (seconds, PSNR), measured on the training views and on the held-out views. The former are drawn as a
-    line, the latter as dots. The grid lines are at 1, 10, 100 … seconds and every 5 dB.
+    `trained` are points (seconds, PSNR) measured on the training views, drawn as a line. `held_out` are points measured on the held-out
+    views, drawn as dots. The grid lines are at 1, 10, 100 … seconds and every 5 dB.
     """
     import numpy as np
 

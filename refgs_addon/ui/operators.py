@@ -180,7 +180,7 @@ class Crop(ReportsErrors, bpy.types.Operator):
 
 
 class _Deletes(ReportsErrors):
-    """Give an operator the splats to delete from, or to restore, and go back to Object Mode. Base class of these operators."""
+    """Find the splats' object for an operator, after a switch to Object Mode. Base class of operators that delete or restore splats."""
 
     splats: StringProperty(name="Splats", description="The object")
 

@@ -297,7 +297,7 @@ def status_words(job: jobs.Job) -> str:
 
 
 def count_words(done: int, total: int, failed: int) -> str:
-    """Describe a batch by how many of its runs are done and have failed, such as "2 of 5 done, 1 failed"."""
+    """Describe how many runs of a batch are done, and how many have failed, such as "2 of 5 done, 1 failed"."""
     return f"{done} of {total} done" + (f", {failed} failed" if failed else "")
 
 
