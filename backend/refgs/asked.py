@@ -65,7 +65,7 @@ class Asked:
     def settings(self, preset: str | None = None) -> Settings:
         """Load the preset with the changes. `preset` replaces the preset asked for. Raises InputError if a setting is wrong.
 
-        If the settings are to be chosen for a time, they are not known yet. The preset `standard` is then loaded in their place.
+        If no preset is given, `standard` is loaded. This is also the case when settings will be chosen later to fit into `minutes`.
         """
         return preset_settings(preset or self.preset or "standard", self._assignments)
 

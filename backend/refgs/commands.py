@@ -127,10 +127,11 @@ def train(asked: Asked, once: bool = False) -> None:
     """Train on a capture and write a run folder, or resume the training in it.
 
     Ctrl-C ends the training with a checkpoint, from which it can be resumed. A second Ctrl-C ends it at once. SIGTERM also ends it with a
-    checkpoint. If this checkpoint is not complete CHECKPOINT_BY seconds after SIGTERM, the training ends without it, and can be resumed
-    from the checkpoint before.
+    checkpoint. If this checkpoint is not complete CHECKPOINT_BY seconds after SIGTERM, the training ends without it. The training can then
+    be resumed from the previous checkpoint.
 
-    With `once`, a training that has ended is left as it is; any other is started or resumed. Its settings must be those of the first call.
+    With `once`, a training that has ended is left as it is; any other is started or resumed. Each call must have the same settings as the
+    first one.
     """
     if once:
         left = train_job.unfinished(asked)
@@ -163,10 +164,10 @@ def train(asked: Asked, once: bool = False) -> None:
 
 @contextmanager
 def _signals_to_stop(repeat: float | None = CHECKPOINT_BY, end: float = END_BY) -> Iterator[list[int]]:
-    """Yield a list to a `with` block, and append each SIGINT or SIGTERM that arrives to it. A second signal ends the block at once.
+    """Yield an empty list to a `with` block. The first SIGINT or SIGTERM is appended to this list. A second signal ends the block at once.
 
     After a first SIGTERM, the process sends itself another one `repeat` seconds later, unless `repeat` is None. It exits `end` seconds
-    after the SIGTERM, even if it is busy.
+    after the first SIGTERM, even if it is busy.
     """
     stopped, timers = [], []
 

@@ -64,7 +64,7 @@ class Effective:
         return replace(self, settings=settings, changes=self.changes | changes)
 
     def chosen(self) -> dict[str, str]:
-        """Return the settings whose values were chosen from the photos, as "value: reason" by key: the table [chosen] of run.toml."""
+        """Return the settings that were chosen from the photos, as {key: "value: reason"}. This is the table [chosen] of run.toml."""
         return {key: f"{change.became}: {change.why}" for key, change in self.changes.items() if change.by == "photos"}
 
     def rows(self) -> dict[str, dict[str, Any]]:

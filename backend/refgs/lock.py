@@ -22,8 +22,8 @@ EVERY = 1.0  # seconds between looks
 class RunLock:
     """Lock a run folder for this process during a `with` block.
 
-    Raises TryAgain if another process has locked it, or if the lock file cannot be opened, because it is another user's or the disk is
-    full. On a file system without locks, nothing is locked.
+    Raises TryAgain if another process has locked the folder. Also raises it if the lock file cannot be opened, for example because the disk
+    is full or because another user owns the file. On a file system without locks, nothing is locked.
 
     Half-written files that killed processes left in the folder are removed. A folder that does not exist is made.
     """

@@ -174,7 +174,7 @@ def hash_file(file: Path, kind: Callable = hashlib.blake2b) -> "hashlib._Hash":
 
 
 def read_bytes(file: Path) -> bytes:
-    """Read a file. Raises OSError if it cannot be read, is a folder, a pipe or a device, or has more than LARGEST bytes."""
+    """Read a file. Raises OSError if `open_file` raises it, or if the file has more than LARGEST bytes."""
     with open_file(file) as opened:
         data = opened.read(LARGEST + 1)
     if len(data) > LARGEST:
@@ -243,7 +243,10 @@ def command_line(*words: object) -> str:
 
 
 def clone_environment() -> dict[str, str]:
-    """Return the environment variables for a Python process that imports modules from its current folder, the root of the repository."""
+    """Return environment variables that let a Python process import modules from its current folder.
+
+    Use it for processes that are started in the root of the repository.
+    """
     return os.environ | {"PYTHONSAFEPATH": ""}
 
 

@@ -43,8 +43,9 @@ class Output(io.RawIOBase):
 def open_streams() -> Output:
     """Make the standard streams safe to use. Returns the `Output` that the standard output writes to.
 
-    A stream that was closed when the process started is opened as the null device. Otherwise a file that is opened later would get the
-    stream's number, and everything that is printed. Characters that the terminal's encoding lacks, as in a path, are escaped.
+    A stream that was closed when the process started is opened as the null device. If it stayed closed, the next file that is opened would
+    get the stream's number, and printed text would be written into that file. Characters that the terminal's encoding lacks, as in a path,
+    are escaped.
     """
     for number in range(3):
         try:

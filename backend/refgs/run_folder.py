@@ -26,9 +26,9 @@ _KEPT = (PHOTOS, "log.txt", LOCK, PROGRESS, STOP)  # does no harm to a new run
 
 
 def check_free(folder: Path) -> None:
-    """Raise InputError if a new run cannot be created in a folder: it holds a run or other files, is a file, or its name is not Unicode.
+    """Raise InputError if a folder cannot take a new run: it is a file, holds a run or other files, or its name is not Unicode.
 
-    A training that was killed before its first checkpoint has learned nothing. Its files do not count.
+    Files of a training that was killed before its first checkpoint do not count, because that training has learned nothing.
     """
     check_unicode(folder)
     if folder.exists() and not (folder.is_dir() and _nothing_learned(folder)):

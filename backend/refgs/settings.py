@@ -23,9 +23,9 @@ class _Section(BaseModel):
 
 
 class RegionSettings(_Section):
-    """Box around the wanted part of a capture, and the result's up direction.
+    """Box around the wanted part of a capture, and the direction that is up in the result.
 
-    Both are in the coordinates that cameras.json has after a training without a region (docs/run-folder.md).
+    Both are in the coordinates of the cameras.json that a training without a region writes (docs/run-folder.md).
     """
 
     centre: Vector = Field(description="centre of the box")
@@ -144,7 +144,7 @@ class TrainSettings(_Section):
 
 
 class InitialSettings(_Section):
-    """Initial stage: each surfel is shaded by itself. Then colour, material and light start anew on the geometry found."""
+    """Initial stage: surfels are shaded before they are blended. Then only geometry is kept; colour, material and light start anew."""
 
     until: float = Field(ge=0, lt=1, description="end of the stage, a part of the training; 0: no such stage")
 
@@ -161,7 +161,7 @@ class IndirectSettings(_Section):
 
 
 class ResidualSettings(_Section):
-    """Residual: an sRGB-encoded colour by direction that adds what material and light do not explain. Left out under another light."""
+    """Residual: a view-dependent sRGB-encoded colour that adds what material and light do not explain. Left out under another light."""
 
     start: float = Field(
         gt=0, le=1, description="start, a part of the training; material and light are frozen from then on. 1: never"
@@ -219,7 +219,7 @@ class LossSettings(_Section):
 
 
 class NeedsSettings(_Section):
-    """Parts of the method that some scenes do without. `auto` measures whether the scene needs a part; `on` keeps and `off` drops it."""
+    """Parts of the method that some scenes do not need. `on` keeps a part, `off` drops it, `auto` measures whether the scene needs it."""
 
     views: Need = Field(description="photos from the same place as another one")
     outside: Need = Field(description="pixels outside the mask, apart from a margin")
@@ -319,9 +319,9 @@ class Assignment(NamedTuple):
 
 
 def load_settings(preset: str, changes: Iterable[str] = ()) -> Settings:
-    """Load a preset by name or a TOML file, and apply `section.key=value` changes.
+    """Load a preset, and apply changes of the form `section.key=value`. `preset` is the name of a preset, or a TOML file.
 
-    A file may start from a preset with `base = "NAME"`. Raises InputError naming the wrong key and what it may be.
+    A file may start from a preset with `base = "NAME"`. Raises InputError naming the wrong key, and the keys or values that are allowed.
     """
     return preset_settings(preset, map(parse_change, changes))
 
@@ -349,7 +349,8 @@ def parse_change(text: str) -> Assignment:
 def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
     """Make `Settings` from the tables of settings that a run recorded. `source` names their file in error messages.
 
-    A key that is newer than the run's release gets the standard preset's value, or the value that works as that release did.
+    A run of an older release may lack a key. The key then gets the value that matches how that release worked, or the value of the preset
+    `standard`.
     """
     # Before these keys existed, light was fixed to the world, there were no exposures and no residual, and nothing was left out.
     still = {"light": {"frame": "world", "exposure": "off"}, "residual": {"start": 1.0}}
@@ -359,9 +360,9 @@ def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
 
 
 def validate(tables: dict[str, Any], source: str) -> Settings:
-    """Make `Settings` from tables, {section: {key: value}}. Raise InputError naming the first wrong key and what it may be.
+    """Make `Settings` from tables, {section: {key: value}}. `source` names the tables' file in error messages.
 
-    `source` names the tables' file in the error's message.
+    Raises InputError naming the first wrong key, and the keys or values that are allowed.
     """
     try:
         return Settings.model_validate(tables)

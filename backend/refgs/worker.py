@@ -213,8 +213,8 @@ class Worker:
     def send(self, event: str, facts: dict[str, Any]) -> None:
         """Write an event to the output as a JSON line.
 
-        If `facts` has a message `what`, its newlines are escaped. If writing fails because nobody reads the output any more, jobs are ended
-        as they are when the input ends, unless the last `Keep` command had `on` = True.
+        If `facts` has a message `what`, its newlines are escaped. If nobody reads the output any more, this counts as the end of the input,
+        unless the last `Keep` command had `on` = True.
         """
         if "what" in facts:
             facts = facts | {"what": one_line(facts["what"])}

@@ -44,9 +44,9 @@ class _Run:
 
     @property
     def failed(self) -> tuple[str, Outcome] | None:
-        """Return the name and outcome of the first failed step, or None. A failure of the step `masks` is ignored.
+        """Return the name and outcome of the first failed step, or None.
 
-        If the masks matter, the training fails, too.
+        A failure of the step `masks` is ignored, because the training can succeed without masks.
         """
         bad = [(name, found) for name in self.nodes if (found := self.outcomes.get(name)) and found.status]
         return next((pair for pair in bad if pair[0] not in OPTIONAL), None)
@@ -79,11 +79,14 @@ class Batch:
     def run(self, engine: Engine, stop: Callable[[int, int, float], bool]) -> int:
         """Run all steps. Captures that are added while the batch runs are trained, too.
 
-        Returns the exit status: TRY_AGAIN if the batch was stopped, or if a step failed for a reason that may pass. Otherwise it is that
-        of a failed step, 1 or 2, or 0 if none failed.
+        Returns the exit status:
 
-        `stop(done, total, seconds)` is called about once a second, with the numbers of ended and of all runs, and the seconds so far.
-        If it returns True, all commands are ended; trainings write checkpoints first.
+        - TRY_AGAIN if the batch was stopped, or if a step failed for a reason that may pass
+        - otherwise 1 or 2 if a step failed with this status, and 1 if both occurred
+        - otherwise 0
+
+        `stop(done, total, seconds)` is called about once a second: `done` of `total` runs have ended, and `seconds` have passed. If it
+        returns True, all commands are ended; trainings write checkpoints first.
 
         Raises InputError if the device is "cuda" and no machine has a CUDA card.
         """
@@ -133,7 +136,10 @@ class Batch:
         write_rows(self._out / LOGS / ROWS, [self._row(run) for run in self._runs.values()])
 
     def _submit(self, job: Job, engine: Engine, card: int | None) -> None:
-        """Hand the steps of a training to the engine, except those that are done already, or that another training has handed over.
+        """Hand the steps of a training to the engine.
+
+        Two kinds of steps are left out: steps that an earlier batch has done, and steps that another training of the same capture has
+        already handed over.
 
         `card` is the memory of a CUDA card in bytes. If it is None, the training uses no card.
         """
@@ -174,7 +180,7 @@ class Batch:
         run.figures, run.picture = figures_of(folder), picture_of(folder)
 
     def _tell(self) -> None:
-        """Report how many runs have ended, and which steps run now. Write rows.json if its last writing was WRITE_EVERY seconds ago."""
+        """Report how many runs have ended, and which steps run now. Write rows.json, but not more often than every WRITE_EVERY seconds."""
         working = []
         for run in self._runs.values():
             for name in run.working():
@@ -187,9 +193,10 @@ class Batch:
             self._write_rows()
 
     def _added(self) -> list[Job]:
-        """Read the list or folder of captures again. Return the trainings that were added, if the files of their captures are complete.
+        """Read the list or folder of captures again, and return the trainings that were added to it.
 
-        If the list has an error, warn of it once and return [].
+        A training is returned only when the files of its capture are complete (see `_settled`). If the list has an error, warn of it once
+        and return [].
         """
         self._looked = time.monotonic()
         try:
@@ -247,7 +254,7 @@ def _progress(run: Path) -> tuple[int, int]:
 
 
 def _settled(capture: Path) -> bool:
-    """Tell whether a capture's files are complete: none has changed for SETTLED seconds. Until then, they may still be being copied."""
+    """Tell whether a capture has been copied completely: none of its files has changed in the last SETTLED seconds."""
     try:
         changed = max(path.stat().st_mtime for path in [capture, *capture.rglob("*")])
     except OSError:

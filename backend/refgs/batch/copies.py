@@ -105,12 +105,12 @@ class Depot:
 def at_hand(reads: tuple[Path, ...], writes: tuple[Path, ...], depot: Any) -> Iterator[None]:
     """Copy files and folders from the batch's machine to this one for a `with` block, and copy back what the block writes.
 
-    `depot` is the actor `Depot` on the batch's machine, on which `refgs batch` runs. Nothing is copied if it is None, or if this machine
-    shares the batch's folder. Otherwise, files are copied before the block, and changes in `writes` are copied back during the block and
-    after it. The copies stay for the next step: see `remove_copies`.
+    `depot` is the actor `Depot` on the batch's machine. If `depot` is None, or if this machine shares the batch's folder, nothing is
+    copied. Otherwise, `reads` and `writes` are copied before the block. Changes in `writes` are copied back during the block and after it.
+    The copies stay for the next step (see `remove_copies`).
 
-    Raises InputError if one of the paths exists here with other files than the original, and is not a copy of an earlier step. Raises
-    TryAgain if the batch's machine does not answer, or if the step was started again on another machine.
+    Raises InputError if this machine has other files at one of these paths. Copies that an earlier step made are no error. Raises TryAgain
+    if the batch's machine does not answer, or if the step was started again on another machine.
     """
     if depot is None:
         yield
@@ -132,7 +132,8 @@ def at_hand(reads: tuple[Path, ...], writes: tuple[Path, ...], depot: Any) -> It
 def remove_copies(roots: list[Path], mark: Path) -> None:
     """Remove the copies of a batch's files and folders `roots` from this machine.
 
-    Nothing is removed if this machine shares the batch's folder: it then sees the file `mark` of the batch's machine.
+    `mark` is a file in the batch's folder. If `mark` exists on this machine, the machine shares that folder. Its files are then the
+    originals, and none is removed.
     """
     if mark.exists():
         return
@@ -156,9 +157,9 @@ def _mark(root: Path) -> Path:
 
 
 def _fetch(root: Path, depot: Any) -> Listing:
-    """Update the copy of a file or folder from its original. Returns the listing of the original, which then is that of the copy, too.
+    """Update the copy of a file or folder from its original. Returns the listing, which is then the same for both.
 
-    Raises InputError if there are other files at `root`, which are not a copy.
+    Raises InputError if this machine has other files at `root` that are not a copy.
     """
     there, here = _get(depot.listing.remote(root)), list_files(root)
     if not _mark(root).exists():

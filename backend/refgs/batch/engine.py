@@ -77,10 +77,10 @@ class Engine:
     def submit(self, step: Step, memory: int, card: float, before: list[tuple[Any, bool]]) -> Any:
         """Hand a step to Ray. Returns a reference to its outcome.
 
-        `memory` is the memory that the step needs, in bytes. It is limited to nine tenths of the memory of the largest machine. `card` is
-        the step's share of a CUDA card, 0 … 1. `before` has a pair for each step that this step waits for. The first entry is the
-        reference that this method returned for that step, or its outcome if it ended in an earlier batch. The second is true if this step
-        may run although that step failed.
+        - `memory`: the bytes that the step needs. At most nine tenths of the largest machine's memory are requested.
+        - `card`: the step's share of a CUDA card, 0 … 1
+        - `before`: a pair for each step that must end first. The pair's first entry is the reference that `submit` returned for that step,
+          or an `Outcome` if that step ended in an earlier batch. The second entry is True if that step may fail.
         """
         how = {
             "num_cpus": self._cores,
@@ -149,10 +149,10 @@ class Engine:
 
     @contextmanager
     def lending(self, folder: Path) -> Iterator[None]:
-        """Let steps on other machines work on copies of this machine's files during a `with` block. `folder` is that of the batch's logs.
+        """Let steps on other machines work on copies of this machine's files during a `with` block.
 
-        A machine that can see `folder` itself, as on a network disk, makes no copies. The copies are removed after the block. If the block
-        raises an error, they stay for the next batch.
+        `folder` is the folder of the batch's logs. A machine that can see it, as on a network disk, makes no copies. The copies are removed
+        after the block. If the block raises an error, they stay for the next batch.
         """
         for old in folder.glob(f"{MARK}*"):
             old.unlink()
@@ -188,12 +188,13 @@ def _card_bytes() -> int:
 
 @contextmanager
 def started(address: str | None, cores: int | None, workers: int | None) -> Iterator[Engine]:
-    """Start Ray on this machine for a `with` block, or join the cluster at `address`, HOST:PORT of its head.
+    """Start Ray on this machine for a `with` block. With `address`, join a cluster instead.
 
-    `cores` is the number of cores of each step; None means one. `workers` is the number of steps that run at once on this machine; None
-    means as many as there are cores for.
+    `address` is HOST:PORT of the cluster's head. `cores` is the number of cores of each step; None means one. `workers` is the number of
+    steps that run at once on this machine; None means as many as there are cores for.
 
-    Raises InputError if Ray is missing or another version, or if no cluster is there, and TryAgain if Ray cannot start here.
+    Raises InputError if Ray is missing or has another version than VERSION, or if there is no cluster at `address`. Raises TryAgain if Ray
+    cannot start on this machine.
     """
     if address and workers:
         raise InputError("--workers is for this machine: on a cluster, each machine says how many cores it lends")
@@ -216,10 +217,10 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
 
 
 def _keep_ignoring(ray: Any) -> None:
-    """Make this process ignore SIGTERM until the end of Ray's shutdown. The caller has set SIGTERM to be ignored already.
+    """Make this process ignore SIGTERM until the end of Ray's shutdown.
 
-    But when Ray closes its log, it restores the system's handler of SIGTERM, which ends the process. So this function makes Ray set SIGTERM
-    to be ignored once more, just before Ray ends its own processes.
+    The caller already ignores SIGTERM. But when Ray closes its log, it restores the default handler, which ends the process. This function
+    makes the process ignore SIGTERM again, just before Ray ends its own processes.
     """
     node = ray._private.worker._global_node
     if node is None or threading.current_thread() is not threading.main_thread():
@@ -253,7 +254,7 @@ def _signals(handler: Any) -> Iterator[None]:
 
 
 def _make_folder() -> Path:
-    """Make a folder for Ray's sockets and logs, which is removed at exit. Remove the folders that killed batches have left.
+    """Make a folder for Ray's sockets and logs, and have it removed at exit. Also remove the folders that killed batches have left.
 
     Only this user can open it. Ray's own folder, in which Ray lets all users write, is inside it and therefore protected.
     """
@@ -271,7 +272,7 @@ def _make_folder() -> Path:
 
 
 def _remove(folder: Path, lock: FileLock) -> None:
-    """Remove a batch's folder. Try for TIDY seconds, because Ray's processes may still be ending, and write in it."""
+    """Remove a batch's folder. Try for TIDY seconds, because Ray's processes may still write files in it while they end."""
     until = time.monotonic() + TIDY
     while (folder / RAY).exists() and time.monotonic() < until:
         shutil.rmtree(folder / RAY, ignore_errors=True)
@@ -281,9 +282,10 @@ def _remove(folder: Path, lock: FileLock) -> None:
 
 
 def _is_left(folder: Path) -> bool:
-    """Tell whether a folder may be left from a killed batch: it looks as `_make_folder` made it, is this user's and over NEW seconds old.
+    """Return True if a folder may be left from a killed batch.
 
-    A younger folder may belong to a batch that has not locked it yet. The caller tests the lock.
+    Such a folder belongs to this user, is over NEW seconds old, and contains nothing but the lock file and Ray's folder. A younger folder
+    may belong to a batch that has not locked it yet. The caller tests the lock.
     """
     facts = folder.stat()
     own = not hasattr(os, "getuid") or facts.st_uid == os.getuid()
@@ -314,7 +316,10 @@ def _import_ray(cluster: bool) -> Any:
 
 
 class _NoPaths(list):
-    """List of folders in which workers look for modules. It stays empty: Ray would add the current folder, where captures may be."""
+    """List of folders from which Ray's workers import modules. It stays empty, even when Ray adds folders to it.
+
+    Ray would add the current folder. If captures lie there, Python files among them could be imported by mistake.
+    """
 
     def extend(self, _: Any) -> None:
         pass

@@ -18,10 +18,10 @@ LIBRARY = "library"  # the folder in RUNS in which Blender makes the runs assets
 
 
 class Ask(BaseModel):
-    """Hold the options of `refgs train` for one level of a batch list, such as a line for a capture.
+    """Hold the options of `refgs train` that one level of a batch gives.
 
-    If `preset` or `minutes` is None, the level above gives the value (see `under`). The `set` options of both levels are joined, and
-    those of the level above come first.
+    The levels are, from top to bottom: the command line, a list, an entry of the list's `settings`, an entry of the list's `captures`. If
+    `preset` or `minutes` is None, the level above gives the value. `set` adds to the `set` options of the level above (see `under`).
     """
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -30,7 +30,11 @@ class Ask(BaseModel):
     set: list[str] = []
 
     def under(self, above: "Ask") -> "Ask":
-        """Return these options, completed by those of the level `above`: `preset` and `minutes` where they are None, and all of `set`."""
+        """Return these options, completed by the options of the level `above`.
+
+        `preset` and `minutes` are taken from `above` if they are None here. The `set` options are those of `above`, followed by those of
+        this level.
+        """
         preset, minutes = self.preset or above.preset, self.minutes or above.minutes
         return Ask(preset=preset, minutes=minutes, set=[*above.set, *self.set])
 
@@ -51,9 +55,13 @@ class _List(Ask):
 
 
 class Job(NamedTuple):
-    """Describe a training of the batch: `name` is that of its run folder, `capture` the capture's folder, and `ask` holds its options.
+    """Describe a training of the batch.
 
-    `capture_name` is the same for all trainings of a capture, which share the steps that find cameras and make masks.
+    - `name`: the name of its run folder
+    - `capture`: the capture's folder
+    - `capture_name`: the name of the capture. All trainings of a capture share the steps that find cameras and make masks. The logs of
+      these steps are kept under this name.
+    - `ask`: the options of the training
     """
 
     name: str

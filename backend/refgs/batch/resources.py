@@ -13,5 +13,8 @@ def memory(settings: Settings) -> int:
 
 
 def card_share(settings: Settings, card: int) -> float:
-    """Return the fraction, 0.01 … 1, of a GPU with `card` bytes of memory that a training takes. Ray divides GPUs by such fractions."""
+    """Return the part of a GPU's memory that a training takes, as a fraction 0.01 … 1. Ray divides GPUs by such fractions.
+
+    `card` is the memory of the GPU in bytes.
+    """
     return round(min(max(memory(settings) / card, 0.01), 1.0), 2)

@@ -43,7 +43,7 @@ class Step(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Hold how a step ended: its exit status, its seconds, the machine, and one line if it failed.
+    """Hold how a step ended: its exit status, its run time in seconds, the machine's name, and the reason in one line if it failed.
 
     The status is None if the step was not run because an earlier step failed, or if the step was cancelled.
     """

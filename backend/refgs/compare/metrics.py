@@ -164,7 +164,7 @@ def aligned_psnr(views: list[np.ndarray]) -> dict[str, float | list[float]]:
     - scale: the correction, one least-squares factor a channel, the same for all views
     - psnr_aligned: the PSNR after each channel is multiplied by its factor
 
-    The correction is made because photos cannot tell a tinted light from tinted base colours.
+    The correction is made because photos do not show whether the light is tinted or the base colours are.
     """
     aa, ab, bb = np.moveaxis(np.array(views), 1, 0)
     power = aa.sum(0)
@@ -183,14 +183,15 @@ def relit(
     """Measure the errors of an object's renderings under another light, as means over the views.
 
     Each call of `pairs()` yields the rendered and the true picture of every view, in premultiplied linear RGBA. Both are composited over
-    white and then compared by each function in `measures`. Returns a dictionary. It has two entries for each function, and one factor:
+    white and then compared by each function in `measures`. Returns a dictionary with two entries for each function, and one factor:
 
     - NAME_raw, such as psnr_raw: the result for the renderings as they are
     - NAME_aligned, such as psnr_aligned: the result after the renderings' radiance is multiplied by `scale`
     - scale: a least-squares factor, the same for all views and functions
 
-    The factor is needed because photos do not tell how bright the base colours are. Its fit leaves out pixels that are 1 or brighter in
-    either picture, such as a sun in a mirror. A few of them would dominate the fit.
+    The factor is needed because photos do not show how bright the base colours are: darker ones under a brighter light look the same. The
+    fit of the factor leaves out pixels that are 1 or brighter in either picture, such as a sun in a mirror. A few of them would dominate
+    the fit.
     """
     product = power = 0.0
     for image, reference in pairs():

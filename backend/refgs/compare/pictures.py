@@ -53,14 +53,14 @@ def color_picture(rendering: Rendering, background: np.ndarray) -> np.ndarray:
 def picture(name: str, value: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Convert one map of a rendering to an 8-bit RGB or grey picture.
 
-    `name` and `value` are an entry of the dictionary that `maps` returns. They may also be "doubt" and a map (H, W) in 0..1 of how little
-    the photos tell metal from paint.
+    `name` and `value` are an entry of the dictionary that `maps` returns. `name` may also be "doubt". `value` (H, W) is then 0 where the
+    photos show whether the surface is metal or paint, and 1 where they do not.
 
     - color: composited over white
     - albedo: sRGB-encoded
     - normal: n/2 + 1/2; black where `alpha` is 0.5 or less
     - depth: divided by its maximum
-    - doubt: the colour TOLD for 0, DOUBTFUL for 1, mixed in between; black where `alpha` is 0.5 or less
+    - doubt: grey (TOLD) where the value is 0, orange (DOUBTFUL) where it is 1, mixed in between; black where `alpha` is 0.5 or less
     - others: only converted from 0..1 to 8 bits
     """
     if name == "color":

@@ -59,16 +59,16 @@ def eroded(mask: np.ndarray) -> np.ndarray:
 def similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray, scaled: bool, lpips: bool) -> dict[str, float]:
     """Measure how alike a rendering and a photo are, as Stanford-ORB does. Both are linear radiance (h, w, 3). Returns by name:
 
-    - psnr_h: PSNR of radiance clipped at MOST_RADIANCE. Both are first multiplied by one factor: the mean of the sRGB-encoded photo divided
-      by the mean of the linear photo. The PSNR's peak is 1, although MOST_RADIANCE is more.
+    - psnr_h: PSNR of radiance. Both pictures are first multiplied by one factor, and then clipped at MOST_RADIANCE. The factor is the mean
+      of the sRGB-encoded photo divided by the mean of the linear photo. The PSNR's peak is 1, although MOST_RADIANCE is more.
     - psnr_l: PSNR of the pictures after clipping to 0..1 and sRGB encoding
     - ssim: SSIM of these encoded pictures, with a Gaussian window of 3×3 pixels and σ 1.5
     - lpips, only if the argument `lpips` is true: LPIPS (VGG-16) of these encoded pictures after a second sRGB encoding, as in
       Stanford-ORB's program
 
-    Both pictures are black outside the eroded mask, and means include this black. If `scaled`, each channel of the rendering is first
-    multiplied by its least-squares factor, which Stanford-ORB does for pictures under another light. A PSNR below that of a uniform grey of
-    0.5 is replaced by the grey's.
+    Both pictures are black outside the eroded mask. Means include these black pixels. If `scaled` is true, each channel of the rendering is
+    first multiplied by its least-squares factor. Stanford-ORB does this for pictures under another light. If a uniform grey of 0.5 has a
+    higher PSNR than the rendering, the PSNR of the grey is returned.
     """
     inside = eroded(mask > 0.5)[..., None]
     image, photo = (np.where(inside, np.maximum(x, 0), 0).astype(np.float64) for x in (image, photo))

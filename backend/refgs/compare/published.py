@@ -71,8 +71,8 @@ class TensoIRTruth(GroundTruth):
 class StanfordORBTruth(GroundTruth):
     """Read the true normals, depths and base colour of a scene of Stanford-ORB, and photos of its object under the lights of other scenes.
 
-    `folder` is the scene's folder. Its test photos have true maps. The files of these maps hold normals in OpenGL's camera axes
-    (`scripts/preprocess/mesh_to_depth.py` in Stanford-ORB's repository), and base colour sRGB-encoded (`orb/utils/test.py`).
+    `folder` is the scene's folder. The scene's test photos have true maps. In the files of the maps, normals are in OpenGL's camera axes
+    (`scripts/preprocess/mesh_to_depth.py` in Stanford-ORB's repository). Base colour is sRGB-encoded (`orb/utils/test.py`).
     """
 
     def _find(self) -> None:
@@ -118,8 +118,9 @@ class StanfordORBTruth(GroundTruth):
     def light(self, view: View) -> np.ndarray:
         """Read the light under which a view's photo was taken. Return a panorama (H, W, 3), rotated to the coordinates of the training.
 
-        The file is in the camera's coordinates. Its middle is the direction in which the camera looks, and its right and top are the
-        camera's. This is the convention of `env_map_to_cam_to_world_by_convention` in `orb/utils/env_map.py` of Stanford-ORB's repository.
+        The panorama in the file is in the camera's coordinates. Its middle shows the direction in which the camera looks. Its top is the
+        camera's top, and its right side is the camera's right. This is the convention of `env_map_to_cam_to_world_by_convention` in
+        `orb/utils/env_map.py` of Stanford-ORB's repository.
         """
         scene = view.image_path.resolve().parent.parent.name
         panorama = read_environment(self._truths / scene / "env_map" / f"{view.image_path.stem}.exr")

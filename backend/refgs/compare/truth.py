@@ -56,8 +56,11 @@ class GroundTruth:
     def maps(self, camera: Camera) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Read the true maps of the camera's view by name, float32 (h, w) or (h, w, 3), and the object's alpha (h, w).
 
-        Larger maps are reduced. If the folder has no maps, return {} and an alpha of 0. Raises InputError if a file is missing, has too few
-        channels or another size than the alpha, or if its size does not fit the view (see `check_size`).
+        Larger maps are reduced. If the folder has no maps, return {} and an alpha of 0. Raises InputError in these cases:
+
+        - A file is missing or has too few channels.
+        - A map has another size than the alpha.
+        - A size does not fit the view (see `check_size`).
         """
         size = camera.height, camera.width
         if not self.passes:
@@ -144,9 +147,9 @@ def known_maps(
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Read one view's true maps, such as normals and base colour, by name. Returns them, and the object's alpha (h, w).
 
-    If `truth` is None or has no maps, read the true normals that some published captures contain. If there are none, return {} and an
-    alpha of 0. `camera` is the view's camera, resized to the rendering. `to_capture` is the matrix (4, 4) from the training's coordinates
-    to the capture's.
+    If `truth` is None or has no maps, read the true normals that some published captures contain. If the capture has no true normals
+    either, return {} and an alpha of 0. `camera` is the view's camera, resized to the rendering. `to_capture` is the matrix (4, 4) from the
+    training's coordinates to the capture's.
     """
     known, alpha = truth.maps(camera) if truth else ({}, np.zeros((camera.height, camera.width), np.float32))
     if not known and (published := published_normals(view, max(camera.width, camera.height))):
@@ -158,8 +161,9 @@ def known_maps(
 def errors(images: dict[str, np.ndarray], known: dict[str, np.ndarray], true_alpha: np.ndarray) -> dict:
     """Measure the errors of one view's rendered maps against the true maps. Returns them by name; {} if the object covers no pixel.
 
-    `images` are the rendered maps (see `pictures.maps`), `known` the true ones (see `known_maps`). The error of base colour is not computed
-    here, because `metrics.aligned_psnr` compares all views at once. Its input, `metrics.channel_products`, is returned as `albedo`.
+    `images` are the rendered maps (see `pictures.maps`), `known` the true ones (see `known_maps`). The entry `albedo` is not an error, but
+    the view's result of `metrics.channel_products`. From these results, `metrics.aligned_psnr` computes one error of base colour for all
+    views.
     """
     figures, covered, alpha = {}, true_alpha >= SOLID, images["alpha"]
     for name, true in known.items() if covered.any() else ():

@@ -19,7 +19,7 @@ LEAST_KNEE = 0.1  # of the chord's height; a curve that bends less has no knee
 class Quantity(NamedTuple):
     """Describe an error measure of history.jsonl by its key in the file and its title. Smaller errors are better.
 
-    `decibels` tells that the file has a PSNR in dB. `error` converts it to an RMS error, for pixel values in 0..1.
+    If `decibels` is True, the file has a PSNR in dB. The method `error` then converts it to an RMS error, for pixel values in 0..1.
     """
 
     key: str
@@ -50,7 +50,7 @@ QUANTITIES = (
 
 
 class Curve(NamedTuple):
-    """Hold the errors (n,) of one run, by one error measure, and the iterations and seconds at which they were measured. Sorted by time."""
+    """Hold one run's values of one error measure: errors (n,), and the iterations and seconds (n,) of measurement, sorted by time."""
 
     run: str
     quantity: Quantity
@@ -124,10 +124,10 @@ def time_to(curve: Curve, error: float) -> float | None:
 
 
 def levels(curves: list[Curve]) -> list[float]:
-    """Choose about LEVELS error values for which the report says when each curve reaches them. Return them with the largest error first.
+    """Choose about LEVELS error values for the table that says when each curve reaches them. Return the largest first.
 
-    They lie between the largest first error and the smallest error of the curves. They are round numbers; if the errors come from a PSNR,
-    they are round in decibels instead.
+    They are round numbers; if the errors come from a PSNR, they are round in decibels instead. The largest is smaller than the error at
+    which the worst curve begins. The smallest is not below the smallest error of all curves.
     """
     quantity = curves[0].quantity
     worst, best = max(c.errors[0] for c in curves), min(c.errors.min() for c in curves)
@@ -142,9 +142,10 @@ def levels(curves: list[Curve]) -> list[float]:
 def as_csv(histories: dict[str, list[dict]], groups: list[list[Curve]]) -> str:
     """Write the numbers behind the report's charts as CSV. The columns are run, iteration, seconds, quantity, value, mark.
 
-    - A row for each point of a curve: its mark is "front" on the Pareto front, "knee" at the knee, both, or empty.
+    - A row for each point of a curve: `mark` is "front" if the point is on the Pareto front, "knee" if it is the curve's knee, "front knee"
+      if it is both, otherwise empty.
     - A row with the mark "reaches": `seconds` is the time after which the curve first reaches the error `value`.
-    - A row with the quantity "part: NAME": `value` is the seconds spent on this kind of work, such as shading.
+    - A row with the quantity "part: NAME": `value` is the seconds spent on the kind of work NAME, such as shading.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -39,12 +39,16 @@ Step = Callable[[int, str, int], None]
 def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None, step: Step) -> dict[str, Any]:
     """Compare a run with the photos of `views`, and with ground truth if it is given. Returns the metrics for metrics.json, such as PSNR.
 
-    If the ground truth is of a published data set, the run is also measured by that data set's protocol (`refgs.report.published`). In this
-    case, the run is rendered only under the other lights that the protocol names.
+    Some ground truth belongs to a published data set. In that case, the run is also measured by that data set's protocol
+    (`refgs.report.published`), and it is rendered only under the other lights that the protocol names.
 
-    Writes pictures into the run's folder: of the views to pictures/`split`, of the light to pictures, and of the run under other lights to
-    pictures/relight. `split` is "test" for held-out views, "train" for training views. After each rendering, `step` is called with the
-    number of renderings that are done, a note, and their total number.
+    Writes pictures into the run's folder:
+
+    - pictures/`split`: the views. `split` is "test" for held-out views, "train" for training views.
+    - pictures: the light
+    - pictures/relight: the run under other lights
+
+    After each rendering, `step` is called with the number of renderings that are done, a note, and their total number.
     """
     pictures, lit = run.folder / "pictures", run.environment is not None
     by_protocol = published.steps(truth, len(views)) if lit else 0  # how often the data set's protocol renders
@@ -135,9 +139,9 @@ def _measure_view(
 
 
 def _doubt(run: Run, camera: Camera) -> np.ndarray:
-    """Render the splats' doubt (0..1: how little the photos tell metal from paint) as a camera sees it. Returns (H, W).
+    """Render the splats' `doubt` as a camera sees it. Returns (H, W) in 0..1.
 
-    The splats must have this value.
+    It is 0 where the photos show whether the surface is metal or paint, and 1 where they do not. `run.splats.doubt` must not be None.
     """
     feature = torch.from_numpy(run.splats.doubt)[:, None]
     drawn = rasterize(*discs(run.surfels(), camera), feature, camera, near=run.near)
@@ -147,8 +151,8 @@ def _doubt(run: Run, camera: Camera) -> np.ndarray:
 def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dict[str, float]]:
     """Compare the recovered light with the true light, and write both as pictures. Returns the metrics.
 
-    If the true light is unknown, or if the recovered light turns with the camera, there is only a picture of the recovered light, and the
-    result is {}.
+    The lights cannot be compared if the true light is unknown, or if the recovered light turns with the camera. Then only the picture of
+    the recovered light is written, and the result is {}.
     """
 
     def write(name: str, panorama: np.ndarray) -> None:
@@ -174,8 +178,8 @@ def _measure_relit(
 ) -> dict[str, float]:
     """Render the views under another light and compare them with ground truth. Returns the metrics.
 
-    Writes the renderings and the true pictures into the folder `pictures`. `hdri` is the light's name in the ground truth. `next_step` is
-    called with a note after each rendering. Each view is rendered twice.
+    Writes the renderings and the true pictures into the folder `pictures`. `hdri` is the light's name in the ground truth. Each view is
+    rendered twice, because keeping all renderings takes too much memory. `next_step` is called with a note after each rendering.
     """
     light = run.light(truth.panorama(f"relight/{hdri}"))
 

@@ -22,8 +22,8 @@ BY_NAME = {  # in this order; other settings follow, under their own names
 def labels(names: list[str], facts: list[Summary]) -> list[str]:
     """Make a unique label for each run from the settings in which the runs differ.
 
-    `facts` are the contents of the runs' run.toml. `names` are the names of the run folders; the label ends with the name if it would
-    otherwise be empty or not unique. If a setting differs only because the presets differ, the label has the name of the preset instead.
+    `facts` are the contents of the runs' run.toml, and `names` are the names of their folders. A label that would be empty or not unique
+    ends with the folder's name. If a setting differs only because the presets differ, the label has the name of the preset instead.
     Settings are named without their section, unless another section has a setting with the same name.
     """
     known = [_settings(summary) for summary in facts]

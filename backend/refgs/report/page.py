@@ -4,10 +4,10 @@ It reads these files of a run folder. If a file is missing, its section is left 
 
     metrics.json     nested objects. Their numbers are metrics: those that `refgs.report.figures` names,
                      relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}, and any others.
-                     Texts are ambiguities.NAME.what and doubt.what: sentences on what photos cannot tell apart.
+                     ambiguities.NAME.what and doubt.what are sentences on what photos leave open, such as metal or paint.
     history.jsonl    one object a line: seconds, iteration, parts (seconds by kind of work), and the errors that `refgs.report.curves` names
-    needs.json       optional features that were kept or left out: a list of {"what", "why"}, with "saved", "cost", "needed" if known, and
-                     "pictures" with and without the feature, in needs/
+    needs.json       a list with an object for each optional part of the training: "what" is the part, "why" the reason to keep it or leave
+                     it out. If known: "needed", "saved", "cost", and "pictures" (files in needs/: a view with and without the part)
     run.toml         the settings, and the capture's folder
     pictures/test/{photo,color,normal,albedo,roughness,metallic}/VIEW.png, and doubt/VIEW.png, true_normal/VIEW.png … if known
     pictures/relight/{truth,refgs,splats,mesh}/HDRI_VIEW.png
@@ -184,8 +184,11 @@ def _needs(file: Path) -> Needs:
 def _decisions(folder: Path, rows: list[Row]) -> list[dict]:
     """Describe for the page which optional parts of the training a run kept or left out. `rows` are those of needs.json.
 
-    Returns a dict for each row: the decision in words, a line with PSNRs, and pictures with and without the part as data URLs. Skips rows
-    without pictures.
+    Returns a dict for each row that has pictures:
+
+    - "what": the decision in words
+    - "figures": a line with the PSNR of one view, rendered with the part and without it
+    - "pictures": data URLs of these two renderings, and of the view's photo
     """
     found = []
     for row in rows:

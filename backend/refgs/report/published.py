@@ -98,8 +98,8 @@ def _relit_as_tensoir(
 ) -> dict[str, float]:
     """Compare renderings of `cameras` under another light with true pictures. Returns the mean "psnr" and "ssim".
 
-    Writes pictures of the `chosen` cameras. Pictures are compared over the run's background, which presets make white, in sRGB-encoded
-    colours.
+    Renderings and true pictures are sRGB-encoded, and lie over the run's background, which presets make white. Writes pictures of the
+    `chosen` cameras.
     """
     light, rows = run.light(truth.panorama(f"relight/{hdri}")), []
     background = np.array(run.settings.image.background, np.float32)
