@@ -24,10 +24,9 @@ _NEIGHBOURS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, 
 def bake(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress = lambda done, total: None) -> Textures:
     """Bake the textures of a mesh, `size` texels on each side, from the splats around it.
 
-    `refgs.render.composite` blends the splats at each texel's point on the mesh. This gives base colour, metallic, roughness and normal,
-    and doubt (0..1: how little the photos tell metal from paint) if the splats have it. `openness` gives occlusion. A texel just outside a
-    chart (a connected piece of the uv layout) has a point on the plane of the nearest face. `progress` is called with the number of points
-    done and their total.
+    `refgs.render.composite` blends the splats at each texel's point on the mesh. This gives base colour, metallic, roughness and normal. It
+    also gives doubt (see `Textures`), if the splats have it. `openness` gives occlusion. A texel just outside a chart (a connected piece of
+    the uv layout) has a point on the plane of the nearest face. `progress` is called with the number of points done and their total.
     """
     coarse = _composited(mesh, splats, size, progress)
     tangents, signs = vertex_tangents(mesh)
@@ -56,8 +55,7 @@ def bake(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress = la
 def _composited(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:
     """Blend the splats at each texel of a texture with C × C texels. Returns the K values of `refgs.render.composite`: (C, C, K).
 
-    C is at most `size`. It is smaller if the splats are large, so that a texel is not much finer than 1/FINE of a splat's standard
-    deviation.
+    C is `size`, or less if the splats are large. Texels need not be finer than 1/FINE of a splat's standard deviation.
     """
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
@@ -116,8 +114,8 @@ def _in_tangent_space(vectors: np.ndarray, *basis: np.ndarray) -> np.ndarray:
     """Convert vectors (N, 3) to tangent space. `basis` is three arrays (N, 3): tangents, bitangents and normals. Returns unit vectors.
 
     A shader converts a vector (x, y, z) back by x·tangent + y·bitangent + z·normal. These three vectors are interpolated, so they are
-    neither orthogonal nor of unit length. Dot products with them would be wrong: x, y and z are the solution of a linear system. z is at
-    least 0.05 before normalization.
+    neither orthogonal nor of unit length. So x, y and z must be found by solving a linear system, not by dot products. z is at least 0.05
+    before normalization.
     """
     a, b, c = basis
     across = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)

@@ -30,11 +30,12 @@ def fit_to_outlines(
 ) -> SmoothMesh:
     """Move a mesh's vertices along their normals until its outlines match the object's outlines in renderings.
 
-    `render` makes the rendering for a camera; at most VIEWS of the cameras are used. First all vertices move outwards by the same distance,
-    the median gap between the two outlines. Then vertices on the mesh's outlines move by the gap at their place. Vertices outside the
-    object's outline move back inside. No vertex moves by more than LARGEST_MOVE times `voxel`. `voxel` is the size in world units of the
-    voxels that the mesh was made from. The mesh is returned unchanged if the renderings show no background around the object, or if most
-    gaps are larger than LARGEST_MOVE + 1 voxels.
+    `render` makes the rendering for a camera; at most VIEWS of the cameras are used. First all vertices move outwards by the same distance:
+    the median gap between the mesh's outlines and the object's. Then each vertex on an outline of the mesh moves by the gap at the vertex.
+    Vertices outside the object's outline move back inside.
+
+    `voxel` is the size in world units of the voxels that the mesh was made from. No vertex moves by more than LARGEST_MOVE voxels. The mesh
+    is returned unchanged if the renderings show no background around the object, or if most gaps are larger than LARGEST_MOVE + 1 voxels.
     """
     chosen = [cameras[i] for i in np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).astype(int)]
     views = [(camera, _signed_distance(render(camera).alpha.numpy())) for camera in chosen]

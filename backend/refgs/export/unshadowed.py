@@ -20,10 +20,10 @@ PASSES = 3
 def unshadowed(splats: Splats, surfels: Surfels, mesh: Mesh, light: Environment) -> Splats:
     """Return splats whose base colours have no shadows and no inter-reflection.
 
-    Use this only if the training did not compute shadows. The learned base colours then contain both. The base colour of a matte splat is
-    divided by a ratio: the irradiance with the mesh, divided by the irradiance without it. The irradiance with the mesh is the direct light
-    that `mesh` does not block, and the light that `mesh` reflects. Metals are unchanged. `surfels` are the same splats as tensors. `light`
-    is the recovered light.
+    Use this only if the training did not compute shadows: then the learned base colours contain shadows and inter-reflection. The base
+    colour of a matte splat is divided by a ratio: the irradiance with the mesh, divided by the irradiance without it. The irradiance with
+    the mesh consists of direct light that `mesh` does not block and of light that `mesh` reflects. Metals are unchanged. `surfels` are the
+    same splats as tensors. `light` is the recovered light.
     """
     shadowed, occluder = surfels.albedo, Occluder(mesh)
     matte = 1 - surfels.metallic[:, None]

@@ -16,7 +16,7 @@ class Layout:
     """Hold measures of how good a mesh's uv layout is.
 
     - used: the fraction of the unit square that is filled
-    - density: texels per surface area, divided by the mean. Two values: the 5th and the 95th percentile over the surface.
+    - density: texels per surface area, relative to the mean of the mesh. Two values: the 5th and the 95th percentile over the surface.
     - bend: how much the uv layout changes the angles of triangles, in degrees. The mean is weighted by area.
     """
 

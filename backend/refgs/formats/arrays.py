@@ -14,9 +14,9 @@ MOST = 75_000_000  # numbers: normals of a photo of 25 million pixels
 def read_array(path: Path, again: str) -> np.ndarray:
     """Read an array from a .npy file, or the first array from a .npz file.
 
-    Raises FileNotFoundError if the file is missing. Raises InputError if the file is broken, holds pickled objects, or declares an array of
-    more than MOST numbers. This size is read before memory is taken for the array. `again` is advice for the user, such as "Save it
-    again.": it ends the message of the InputError.
+    Raises FileNotFoundError if the file is missing. Raises InputError if the file is broken, holds pickled objects, or declares more
+    numbers than the limit MOST. The limit is checked before memory is taken for the array. The message of the InputError ends with `again`,
+    advice for the user such as "Save it again."
     """
     try:
         check_file(path)

@@ -94,7 +94,7 @@ def count_images(file: Path) -> int:
 def read_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read the points (M, 3) of a COLMAP model and their colours (M, 3), sRGB-encoded in 0..1. Raises InputError for a broken file.
 
-    Points with a value that is NaN, infinite or beyond FARTHEST are left out: such points are mistakes.
+    Points are left out if a coordinate is NaN, infinite, or beyond ±FARTHEST.
     """
     return _parse(file, _binary_points, _text_points)
 
@@ -137,7 +137,7 @@ class _Reader:
         """Read the number of rows, then yield the identifier of each row. `kind` is the identifier's format as in `struct`, such as "I".
 
         The caller must read the other values of a row before it asks for the next identifier. Raises ValueError if two consecutive rows
-        have the same identifier. This finds files with a hole, because a hole reads as zeros.
+        have the same identifier. This finds files in which a part was never written, because such a part reads as zeros.
         """
         last = None
         for _ in range(self.take("Q")[0]):
@@ -195,7 +195,7 @@ def _points(numbers: array) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _entries(file: Path, first: Callable[[str], bool] = lambda line: True) -> list[str]:
-    """Return the lines of a COLMAP text file that begin an entry: those for which the function `first` returns True.
+    """Return the first line of each entry in a COLMAP text file. The function `first` returns True for such a line.
 
     Comments and empty lines are left out. Raises ValueError if a line is too long, or if the file has fewer entries than its header says.
     """
@@ -235,9 +235,9 @@ def _text_images(file: Path) -> list[Image]:
 
 
 def _is_image(line: str) -> bool:
-    """Return True for a line of images.txt that describes an image, False for a line of keypoints, which some programs leave out.
+    """Return True if a line of images.txt describes an image, and False if it lists keypoints.
 
-    An image's line ends in the image's name. A line of keypoints has triples of numbers. Raises ValueError for a line that is neither.
+    An image's line ends in the image's name. A list of keypoints has three numbers for each keypoint. Raises ValueError for any other line.
     """
     values = line.split()
     try:

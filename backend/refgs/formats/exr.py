@@ -42,7 +42,7 @@ def read_exr_header(path: str | os.PathLike) -> tuple[int, int, bool]:
     """Read an EXR file's width, its height, and whether it has alpha. No pixels are decoded.
 
     If the file has several parts, the three values are those of the part that `read_exr` reads. Raises InputError if the file is missing or
-    broken, or if its pixels are a crop of the picture or extend beyond it (overscan).
+    broken, or if its data window differs from its display window (a crop or overscan).
     """
     path = Path(path)
     if not path.is_file():
@@ -110,7 +110,7 @@ def read_exr(path: str | os.PathLike, is_data: bool = False) -> np.ndarray:
 def _as_rec709(path: Path, pixels: np.ndarray, primaries: np.ndarray) -> np.ndarray:
     """Convert linear pixels (H, W, 3 | 4) from a file's chromaticities `primaries` to Rec.709, in place.
 
-    Colours beyond Rec.709 get negative components. Raises InputError, which names `path`, if the chromaticities span no colours.
+    Colours outside Rec.709's gamut get negative components. Raises InputError, which names `path`, if `primaries` give no finite matrix.
     """
     if primaries.shape == np.shape(REC709) and np.allclose(primaries, REC709, atol=1e-3):
         return pixels
@@ -124,7 +124,7 @@ def _as_rec709(path: Path, pixels: np.ndarray, primaries: np.ndarray) -> np.ndar
 
 
 def _check_flat(path: Path, headers: list[dict]) -> None:
-    """Raise InputError, which names `path`, if a file is deep: each of its pixels has a list of samples."""
+    """Raise InputError, which names `path`, if a file is a deep EXR. In a deep EXR, each pixel has a list of samples."""
     if any(header["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile) for header in headers):
         raise InputError(f"{path} is a deep EXR: save it flattened, with one value a pixel")
 

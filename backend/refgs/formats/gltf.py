@@ -99,10 +99,9 @@ def read_glb(path: str | os.PathLike) -> Mesh:
 
 
 def _check_self_contained(data: bytes) -> None:
-    """Raise ValueError if a binary glTF file names other files, or declares more numbers than it has bytes.
+    """Raise ValueError if a binary glTF file refers to other files, or has an accessor with more elements than the file has bytes.
 
-    Without this check, reading the file could read any other file of the computer, or take any amount of memory. `data` is the file's
-    content: a header of 12 bytes, then the length and the kind of the JSON chunk, then that chunk (glTF 2.0, "GLB File Format").
+    Without this check, a file could make its reader open any other file, or allocate any amount of memory. `data` is the file's content.
     """
     length, kind = struct.unpack_from("<I4s", data, 12)
     if kind != b"JSON":

@@ -16,7 +16,7 @@ KINDS = get_args(Kind)
 
 
 class Hint(NamedTuple):
-    """Hold a user's hint: one part of the surface is of this `kind`, "metal" or "paint".
+    """Hold a user's hint: the material `kind` of a part of the surface, "metal" or "paint".
 
     `points` (P, 3) are positions on the part, in the run's coordinates. Each point marks the splat that is nearest to it.
     """

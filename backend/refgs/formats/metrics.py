@@ -1,4 +1,4 @@
-"""Describe metrics.json: the figures and sentences that evaluating a run gives, as nested objects (docs/run-folder.md)."""
+"""Describe metrics.json: the results of evaluating a run, as nested objects (docs/run-folder.md)."""
 
 from pathlib import Path
 from typing import Any
@@ -13,16 +13,17 @@ class _Figures(RootModel[dict[str, JsonValue]]):
 
 
 class Said(Model):
-    """Hold `what`, a sentence that tells the user about a measurement, or None if there is nothing to tell."""
+    """Hold a message for the user, `what`, about a measurement. `what` is None if there is nothing to report."""
 
     what: str | None = None
 
 
 class Metrics(Model):
-    """Hold the sentences in metrics.json about what photos cannot tell apart.
+    """Hold the messages in metrics.json about light and materials that the photos leave open.
 
-    - `ambiguities`: for each change of light or materials, by its name: whether another change hides it in all pictures
-    - `doubt`: surfaces that may be metal or paint
+    - `ambiguities`: messages about two changes that cancel in all pictures, by the pair's name. For example, darker base colours cancel a
+      brighter light.
+    - `doubt`: a message about surfaces that may be metal or paint
     """
 
     ambiguities: dict[str, Said] = Field(default_factory=dict)

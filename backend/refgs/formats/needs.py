@@ -44,8 +44,8 @@ class Found(Model):
     - `decibels`: what leaving the part out costs, in PSNR on the training views
     - `side`: the reduced side of the light's cubemap, in texels; only for the part "light"
     - `total`: the reduced number of iterations; only for the part "iterations"
-    - `again`: how much colours changed with the view (0..1) when a scene taken for matte was measured a second time, halfway through the
-      training; only for the part "specular"
+    - `again`: how much colours change with the view (0..1), measured halfway through the training. Only for the part "specular", in scenes
+      that were judged matte at first.
     - `pictures`: renderings with and without the part, or None
     """
 

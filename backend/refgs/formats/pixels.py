@@ -28,9 +28,9 @@ SCANS = 100  # of a JPEG; cameras write 1, and programs 10 of a progressive one.
 
 
 def check_pixels(path: Path, width: int, height: int, small: int = SMALL, per_byte: int = MOST_PER_BYTE) -> None:
-    """Raise InputError if a picture's file declares more than MOST pixels, or more than a file of its size can hold.
+    """Raise InputError if a picture's file declares more pixels than a limit.
 
-    A file of B bytes is assumed to hold at most `per_byte` · B pixels, or `small` pixels if that is more.
+    The limit is `per_byte` pixels for each byte of the file, but at least `small` and at most MOST.
     """
     size = f"{path}: {width}×{height} pixels"
     if width * height > MOST:
@@ -40,9 +40,10 @@ def check_pixels(path: Path, width: int, height: int, small: int = SMALL, per_by
 
 
 def check_length(path: Path) -> None:
-    """Check the file of a photo before Pillow opens it. Raises OSError if the file is empty, or not an ordinary file.
+    """Check the file of a photo before Pillow opens it.
 
-    Raises ValueError if the file is a WebP, HEIC or AVIF of more than LONGEST bytes, because Pillow reads such files as a whole.
+    Raises OSError if the file is empty, or not an ordinary file. Raises ValueError for a WebP, HEIC or AVIF file of more than LONGEST
+    bytes, because Pillow would read the whole file into memory.
     """
     check_file(path)
     if path.stat().st_size > LONGEST:
@@ -79,11 +80,11 @@ def png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
 
 
 def check_scans(path: Path, width: int, height: int) -> None:
-    """Raise InputError if a JPEG has more than SCANS scans. Even a small file with so many would take minutes to decode.
+    """Raise InputError if a JPEG has more than SCANS scans, because it would take minutes to decode.
 
-    Scans are counted by their markers (ITU-T T.81, annex B). A marker is 0xFF and a code byte. After most markers comes a segment: its
-    length in two bytes, which includes these two, and its data. In the compressed pixels, 0xFF is followed only by 0 or by the code of a
-    restart marker. At most 8 · `width` · `height` + LARGEST bytes of the file are searched.
+    Scans are counted by their markers (ITU-T T.81, annex B). A marker is 0xFF and a code byte. Compressed pixels are not mistaken for such
+    a marker: in them, only 0 or the code of a restart marker follows 0xFF. At most 8 · `width` · `height` + LARGEST bytes of the file are
+    searched.
     """
     with open_file(path) as file:
         data = file.read(min(8 * width * height + LARGEST, LONGEST))
@@ -111,8 +112,8 @@ def read_png(path: Path, flags: int = -1) -> np.ndarray | None:
 def decode(path: Path, flags: int, width: int, height: int) -> np.ndarray | None:
     """Decode a PNG, TIFF or Radiance picture as `cv2.imread` does with these `flags`. Return None if it is broken or of another format.
 
-    `width` and `height` are the size in the picture's header. Raises OSError if the file cannot be read, and InputError if the file is far
-    larger than so many pixels can be.
+    `width` and `height` are the size in the picture's header. Raises OSError if the file cannot be read. Raises InputError if the file has
+    far more bytes than a picture of this size can take.
 
     Other formats are not given to OpenCV, because nobody needs them here and their decoders are a risk: the JPEG 2000 decoder of OpenCV
     4.11 writes out of bounds (CVE-2025-53644).

@@ -88,10 +88,11 @@ def _count_lines(file, path: Path) -> int:
 
 
 def _elements(lines: list[list[str]], path: Path) -> list[tuple[int, list[tuple[int, float]]]]:
-    """Parse the lines of a PLY header, split into words. Returns, for each element, its number of rows and a list of its properties' sizes.
+    """Parse a PLY header. `lines` are its lines, each split into words.
 
-    A size is a pair: the fewest and the most bytes that the property takes in a row of a binary file. They differ only for a list property,
-    which stores the number of its values before the values. Raises InputError for a broken header.
+    Returns a pair for each element: its number of rows, and a list of its properties' sizes. A size is itself a pair: the fewest and the
+    most bytes that the property takes in a row of a binary file. The two differ only for a list property, which stores the number of its
+    values before the values. Raises InputError for a broken header.
     """
     elements: list[tuple[int, list[tuple[int, float]]]] = []
     for line in lines:

@@ -17,9 +17,9 @@ class Maker(Model):
 
 
 class Made(Model):
-    """Hold the release of RefGS that made a run, as the table `run` of run.toml states it.
+    """Hold the release of RefGS in a run.toml; no other key is read.
 
-    The release is checked before the other keys are read, because their format may differ in a newer release.
+    The release is checked first, because the format of the other keys may differ in a newer release.
     """
 
     run: Maker

@@ -27,16 +27,17 @@ class Splats:
     """Hold N splats with their appearance and materials, as float32 numpy arrays.
 
     - positions (N, 3), in world units
-    - normals (N, 3), unit vectors. They point outwards where that is known.
+    - normals (N, 3), unit vectors. They point outwards if RefGS trained the splats. In files of other programs, some may point inwards.
     - sh (N, K, 3): spherical harmonics, K = (degree + 1)². The colour is 0.5 + SH, as in 3DGS.
     - opacities (N,) in 0..1
     - scales: standard deviations in world units; (N, 2) for surfels, (N, 3) for 3D Gaussians. The third scale is along the normal.
     - rotations (N, 4): unit quaternions wxyz
     - albedo (N, 3), linear Rec.709; metallic (N,) and perceptual roughness (N,) in 0..1
-    - received (N, 3): the irradiance, divided by the irradiance without occlusion. It includes light that the object reflects to itself.
+    - received (N, 3): the irradiance, divided by the irradiance without occlusion. The irradiance includes light that the object reflects
+      to itself.
     - indirect (N, K', 3): spherical harmonics of the linear radiance that other parts of the object reflect to the splat. Without
       inter-reflection, K' is 0 and `received` is 1.
-    - doubt (N,) in 0..1: 0 if photos tell whether the splat is metal or paint, 1 if they do not; None if unknown
+    - doubt (N,) in 0..1: 0 if photos show whether the splat is metal or paint, 1 if they leave it open; None if unknown
     - constants: material values that are the same for all splats, by name (see CONSTANTS). Files store them in the header.
     - others: further elements and properties of the PLY file that was read. `write_splats` writes them again.
     """

@@ -21,9 +21,9 @@ class Textures:
     - base_color (S, S, 3), linear Rec.709
     - metallic, roughness and occlusion (S, S)
     - normal (S, S, 3): unit vectors in MikkTSpace tangent space, y along v (OpenGL, glTF and Blender)
-    - mask (S, S), bool: true for a texel if its centre, or a neighbour's centre, lies on the mesh. A bilinear look-up on the mesh reads
-      only these texels. The other texels are padding: copies of the nearest texel in the mask.
-    - doubt (S, S) in 0..1: how little the photos tell whether a texel is metal or paint; None if the run has no such values
+    - mask (S, S), bool: true for a texel if its centre, or a neighbour's centre, lies in a triangle of the uv layout. A bilinear look-up on
+      the mesh reads only these texels. The other texels are padding: copies of the nearest texel in the mask.
+    - doubt (S, S) in 0..1: 0 where photos show whether the surface is metal or paint, 1 where they leave it open; None if unknown
     - specular: 1, or 0 for a material without specular reflection
     """
 
@@ -40,8 +40,8 @@ class Textures:
 def write_textures(folder: Path, textures: Textures) -> dict[str, np.ndarray]:
     """Write each texture map twice: as 8-bit PNG, and as linear float EXR. Returns the 8-bit pictures by name.
 
-    The EXR files are for mirrors, where the steps of 8-bit normals are visible. Normals are mapped to 0..1 in both. Base colour is
-    sRGB-encoded in the PNG. A failed write leaves no partial file.
+    The EXR files are needed for mirror-like surfaces, on which the steps of 8-bit normals are visible. Normals are mapped to 0..1 in both
+    files. Base colour is sRGB-encoded in the PNG. A failed write leaves no partial file.
     """
     maps = {
         "base_color": textures.base_color,

@@ -2,8 +2,8 @@
 
 Intrinsics (`fl_x fl_y cx cy w h`, or `camera_angle_x` and `camera_angle_y` in radians) and the lens (`camera_model`, `is_fisheye`, and
 coefficients such as `k1` and `p1`) are given for all frames at the file's top level, or in a frame. If both are given, the frame's value is
-used. The format is documented in nerfstudio's "Data conventions" and instant-ngp's "Tips for training NeRF models". instant-ngp's keys
-`scale` and `offset` are ignored: they only place the scene in its unit cube.
+used. The format is documented in nerfstudio's "Data conventions" and instant-ngp's "Tips for training NeRF models". The keys `scale` and
+`offset` are ignored: they only place the scene in the unit cube of instant-ngp.
 """
 
 import re
@@ -92,7 +92,7 @@ class Transforms(_Cameras):
 
     - `train_filenames`, `test_filenames`, `val_filenames`: the names of the training, test and validation photos
     - `ply_file_path`: the path of a point cloud
-    - `to_capture`: the matrix (4, 4) from a run's coordinates to those of the capture that it was trained on
+    - `to_capture`: the matrix (4, 4) from a run's coordinates to its capture's coordinates
     """
 
     frames: list[Frame]
@@ -107,7 +107,7 @@ class RunFrame(Frame):
     """Hold a camera in a run's cameras.json.
 
     - `split`: "train", or "test" for a held-out view
-    - `exposure`: the photo's radiance divided by the scene's; one number, or one each for red, green and blue
+    - `exposure`: the photo's radiance divided by the scene's: one number, or three numbers for red, green and blue
     - `refined`: true if the training refined the camera's pose
     """
 
@@ -117,7 +117,10 @@ class RunFrame(Frame):
 
 
 class RunCameras(_Cameras):
-    """Hold a run's cameras.json: cameras in the run's coordinates, and the matrix `to_capture` from these to the capture's coordinates."""
+    """Hold a run's cameras.json. The cameras are in the run's coordinates.
+
+    `to_capture` is the matrix from the run's coordinates to the capture's coordinates.
+    """
 
     frames: list[RunFrame]
     to_capture: Matrix

@@ -1,7 +1,7 @@
 """Read JSON and TOML files into validated models.
 
-A file that is wrong raises an InputError of one line: the file, the field, what is wrong with it, and what to do. The caller says what to
-do by the argument `again`, such as "Train again."
+If a file is wrong, InputError is raised. Its message is one line, which names the file and the field and says what is wrong. The line ends
+with advice for the user, which the caller gives as `again`, such as "Train again."
 """
 
 import json
@@ -24,7 +24,7 @@ Matrix = list[list[float]]
 
 
 class Model(BaseModel):
-    """Declare the fields of a file that are read, in a subclass for each kind of file. Other fields of the file are ignored."""
+    """Serve as the base class of models. A model declares the fields that are read from one kind of file. Other fields are ignored."""
 
     model_config = ConfigDict(frozen=True)
 

@@ -1,7 +1,8 @@
-"""Find where masks show an object's surface: where a ray through a mask's outline meets the visual hull only near one point.
+"""Find where masks show an object's surface.
 
-A ray through an outline touches the object somewhere. If it meets the hull only near one point, the surface is there. If it runs along the
-hull, the surface may be anywhere below the hull. It does so along a flat face, and across the opening of a bowl, which the hull closes.
+A ray through a mask's outline touches the object somewhere. If the ray meets the visual hull only near one point, the surface is there. If
+the ray runs along the hull, the surface may be anywhere below the hull. Rays run along the hull at flat faces. They also do so at the
+opening of a bowl, because the hull closes the opening.
 """
 
 from collections.abc import Sequence
@@ -19,11 +20,11 @@ ACROSS = 200  # pixels across the object, in the reduced masks
 
 
 def contact(shape: Shape, alphas: Sequence[np.ndarray], cameras: Sequence[Camera]) -> np.ndarray:
-    """Measure how well outlines show the surface at each voxel. Returns (X, Y, Z) in world units; smaller is better.
+    """Measure how well outlines show the surface at each voxel. Returns lengths (X, Y, Z) in world units: the shorter, the better.
 
-    `shape` is the visual hull, and `alphas` are the masks (H, W), uint8. Rays run from the cameras through the outlines of the masks. A
-    voxel's value is half the length on which a ray through it runs in the shape. If several rays pass the voxel, the least of their values
-    counts. The value is infinite if no ray passes.
+    `shape` is the visual hull, and `alphas` are the masks (H, W), uint8. Rays are traced from the cameras through the outlines of the
+    masks. The value of a ray is half the length of its part inside the hull. The value of a voxel is the smallest value of the rays through
+    it. It is infinite if there is no ray through the voxel.
     """
     centre, radius = shape.ball
     step = STEP * float(shape.voxel.min())

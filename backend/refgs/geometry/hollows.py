@@ -22,10 +22,10 @@ def carve_hollows(alpha: np.ndarray, low: np.ndarray, voxel: np.ndarray, photos:
     """Remove cells from a visual hull if photos see through them. Returns the fraction of each voxel that is left, (X, Y, Z) in 0..1.
 
     The hull is where `alpha` (X, Y, Z) is above one half. Voxels have the size `voxel` (3,), and the first has its corner at `low` (3,), in
-    world units. A cell is a cube of CELL³ voxels. It is empty if enough photos see a surface behind it (see `stereo.depth_maps`), and few
+    world units. A cell is a cube of CELL³ voxels. It is removed if enough photos see a surface behind it (see `stereo.depth_maps`), and few
     photos see a surface in it.
 
-    The light must not move relative to the object. On a turntable it does, and highlights look like a surface on the turntable's axis.
+    The light must not move relative to the object. If it does, as on a turntable, highlights look like a surface on the turntable's axis.
     """
     shape = Shape(alpha > 0.5, np.asarray(low), np.asarray(voxel))
     cells = Shape(shape.solid[::CELL, ::CELL, ::CELL], shape.low, CELL * shape.voxel)
@@ -40,11 +40,11 @@ def carve_hollows(alpha: np.ndarray, low: np.ndarray, voxel: np.ndarray, photos:
 
 
 def _empty(shape: Shape, maps: Sequence[DepthMap], least: float) -> np.ndarray:
-    """Tell which cells of a shape are empty: bool (X, Y, Z). Depth maps vote, with the weights of their depths.
+    """Find the empty cells of a shape by votes of depth maps. Returns bool (X, Y, Z). The cells are the voxels of `shape`.
 
-    A map votes for a cell if its surface lies behind the cell, and against if its surface lies in the cell. A cell is empty if at least
-    `least` maps see through it, and if more than the fraction FREE of the votes is for it. Votes are smoothed over neighbouring cells. The
-    voxels of `shape` are the cells.
+    A depth map votes for "empty" in cells in front of its surface, and for "full" in cells on its surface. A vote has the weight of the
+    map's depth there. Votes are smoothed over neighbouring cells. A cell is empty if at least `least` maps see through it, and if "empty"
+    gets more than the fraction FREE of the votes.
     """
     cells = np.argwhere(shape.solid)
     points = shape.low + (cells + 0.5) * shape.voxel

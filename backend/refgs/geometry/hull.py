@@ -166,9 +166,10 @@ def _sample_triangles(vertices: np.ndarray, faces: np.ndarray, count: int, rng: 
 
 
 def _choose_evenly(dense: np.ndarray, count: int) -> np.ndarray:
-    """Choose `count` evenly spaced points from `dense`, which has many more, by a few Lloyd iterations. Returns (count, 3).
+    """Choose `count` evenly spaced points from a larger set of points, `dense`, by a few Lloyd iterations. Returns (count, 3).
 
-    Each iteration groups all points by the nearest chosen point. Then the point nearest to a group's mean is chosen for the group.
+    Each iteration assigns every point to the nearest chosen point. This forms groups. The point nearest to a group's mean is then chosen
+    for the group.
     """
     chosen = dense[:: len(dense) // count][:count]
     for _ in range(5):

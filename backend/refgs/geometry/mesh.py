@@ -17,8 +17,8 @@ def clean(mesh: Mesh, triangles: int) -> SmoothMesh:
 
     - Crumbs are removed: connected parts with less than KEEP times the largest part's area.
     - Holes of at most HOLE edges are closed. The object has no holes there; the surface is missing because no photo shows it.
-    - Frays are removed: parts of the surface, such as strips, that are so narrow that all their vertices are less than FRAY faces from the
-      border. Thin parts of a closed surface stay, because it has no border.
+    - Frays are removed: narrow strips along a border. All vertices of a fray are less than FRAY faces from the border. Thin parts of a
+      closed surface stay, because it has no border.
 
     Simplification is by quadric error (Garland and Heckbert 1997). In the returned mesh, no edge has more than two faces. Faces keep their
     winding. Raises InputError if the mesh has no valid face.
@@ -129,7 +129,7 @@ def _manifold(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def is_crumbs(mesh: Mesh, many: int = 5) -> bool:
-    """Tell whether a mesh is in pieces: more than `many` connected parts, and none has half of the area."""
+    """Tell whether a mesh is in pieces: it has more than `many` connected parts, and each part has less than half of the whole area."""
     _, areas = parts(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
     return len(areas) > many and areas.max() < areas.sum() / 2
 

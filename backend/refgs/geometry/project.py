@@ -22,7 +22,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def pixel_rays(camera: Camera, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return rays (N, 3) through N pixels, in the world's axes. Each ray's component along the camera's axis is 1.
 
-    `rows` and `columns` (N,) are indices of pixels, and may be fractions: 0 is the centre of the first.
+    `rows` and `columns` (N,) are indices of pixels. An integer means the centre of a pixel; fractions are allowed.
     """
     x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
     return np.stack([x, y, np.ones(len(x))]).T @ camera.world_to_camera[:3, :3]
@@ -51,9 +51,10 @@ def remap(
     border: int = cv2.BORDER_CONSTANT,
     outside: float = 0.0,
 ) -> np.ndarray:
-    """Interpolate an image at columns and rows `at` (H, W, 2) float32, by OpenCV's `remap`. Returns (H, W) or (H, W, C).
+    """Interpolate an image at the positions `at` (H, W, 2), by OpenCV's `remap`. Returns (H, W) or (H, W, C).
 
-    The centre of the first pixel is at (0, 0). Outside the image, the first channel is `outside`, and other channels are 0.
+    A position is a column and a row, float32. The centre of the first pixel is at (0, 0). Outside the image, the first channel is
+    `outside`, and other channels are 0.
     """
     one_map = np.empty(0, np.float32)  # in place of a second map: `at` has both coordinates
     return cv2.remap(image, at, one_map, interpolation, borderMode=border, borderValue=(outside,))

@@ -104,12 +104,16 @@ class _Reduced(NamedTuple):
 def depth_maps(photos: Sequence[Photo], shape: Shape, unsure: np.ndarray) -> list[DepthMap]:
     """Estimate the depth of an object's surface in photos. The surface is looked for in `shape`, such as the masks' visual hull.
 
-    Depth is only estimated in pixels whose rays enter the shape in a voxel of `unsure` (X, Y, Z), bool. These are the voxels where the
-    caller does not know the surface.
+    Depth is only estimated in pixels whose rays enter the shape in a voxel of `unsure` (X, Y, Z), bool. In the other voxels, the caller
+    knows the surface already.
 
-    Returns a map for each photo that has at least BEST neighbours. A depth has a weight above 0 only if the neighbours show the photo's
-    texture in the same place, and if the depth maps of at least AGREE neighbours agree with it. A mirror shows images of other things
-    behind its surface. Such images seldom agree in a curved mirror, but they do in a flat one, so its depths may be wrong.
+    Returns a map for each photo that has at least BEST neighbours. A depth has a weight above 0 only under two conditions:
+
+    - The neighbours show the photo's texture in the same place.
+    - The depth maps of at least AGREE neighbours agree with the depth.
+
+    Depths may be wrong in a flat mirror, because photos agree on its mirror images, which lie behind its surface. Photos of a curved mirror
+    seldom agree.
     """
     centre, radius = shape.ball
     reduced = [_reduced(photo, shape) for photo in photos]
@@ -176,7 +180,7 @@ def _sweep(photo: _Reduced, others: list[_Reduced], shape: Shape, unsure: np.nda
 def _entry(camera: Camera, rays: np.ndarray, planes: np.ndarray, within: np.ndarray, shape: Shape) -> np.ndarray:
     """Return the points (N, 3) at which N rays of a camera enter a shape.
 
-    `planes` are the depths of P planes. `within` (P, N) is true where the point at which a ray meets a plane lies in the shape.
+    `planes` (P,) are the depths of planes. `within` (P, N) is true for a plane and a ray if they meet in the shape.
     """
     first = within.argmax(axis=0)
     before, after = planes[np.maximum(first - 1, 0)], planes[first]
@@ -190,9 +194,10 @@ def _entry(camera: Camera, rays: np.ndarray, planes: np.ndarray, within: np.ndar
 def _scores(
     photo: _Reduced, others: list[_Reduced], planes: np.ndarray, rows: np.ndarray, columns: np.ndarray
 ) -> np.ndarray:
-    """Compare a photo with the `others`, projected onto planes at P depths that face its camera.
+    """Compare a photo with the photos `others`, projected onto P planes. The planes are at right angles to the axis of the photo's camera.
 
-    Returns an array (P, N) for the N pixels at `rows` and `columns`. Each value is the mean of the BEST largest correlations with `others`.
+    `planes` (P,) are the depths of the planes. Returns an array (P, N) for the N pixels at `rows` and `columns`. Each value is the mean of
+    the BEST largest correlations with `others`.
     """
 
     def mean(picture: np.ndarray) -> np.ndarray:

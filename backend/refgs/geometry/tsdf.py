@@ -32,14 +32,14 @@ def fuse(
 ) -> Mesh:
     """Fuse depth maps into a mesh, inside the cube of half-side `radius` about `centre`, on a grid of `resolution`³ voxels.
 
-    `depths` (H, W) are distances along the camera's axis in world units, already divided by alpha. `alphas` (H, W) are in 0..1,
-    or booleans that say whether alpha is at least 0.5. All tensors are on the same device. Most of the work is done on this device.
+    `depths` (H, W) are distances along the camera's axis in world units, already divided by alpha. `alphas` (H, W) are in 0..1, or booleans
+    that say whether alpha is at least 0.5. All tensors are on the same device. Most of the work is done on this device.
 
     - A pixel with alpha below 0.5 is background: space along its whole ray is empty. So the silhouettes carve the mesh. For photos without
       masks, alpha is 1 and nothing is carved.
-    - A pixel beside a jump in depth or alpha has a small weight. Only voxels near its surface point use it. It does not mark the space in
-      front as empty, because its ray may have missed another surface by half a pixel.
-    - Voxels are stored only in blocks near the depth of some pixel. So time and memory grow with the surface, not with the cube.
+    - A pixel beside a jump in depth or alpha has a small weight. It affects only voxels near its surface point. It does not mark the space
+      in front as empty, because its ray may have missed another surface by half a pixel.
+    - Voxels are stored only in blocks near the surface points of pixels. So time and memory grow with the surface, not with the cube.
 
     The mesh's faces point outwards. The mesh has holes where no camera saw the surface, and it is empty if there is no surface.
     """

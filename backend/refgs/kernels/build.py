@@ -32,7 +32,7 @@ FLAGS += ["-fno-builtin", "-ffp-contract=on", "-fno-math-errno", "-mprefer-vecto
 
 @dataclass(frozen=True)
 class Target:
-    """Describe what a library is compiled for: platform and processor, by Zig's names, and the library's file extension."""
+    """Describe what a library is compiled for. Platform and processor are names of Zig; `extension` is the library's file extension."""
 
     platform: str
     processor: str
@@ -75,9 +75,9 @@ def _fingerprint(target: Target) -> str:
 
 
 def sizes() -> dict[str, int]:
-    """Find the C++ functions that return one integer, such as a buffer's size. Returns the number of integer arguments of each, by name.
+    """Return the number of integer arguments of each C++ function that returns one integer, by the function's name.
 
-    Python needs this number to declare and call the functions.
+    Such a function returns a buffer's size, for example. Python needs the number of arguments to declare and call the function.
     """
     text = "".join((HERE / source).read_text(encoding="utf-8") for source in SOURCES)
     found = re.findall(r"^EXPORT int64_t (\w+)\((.*?)\)", text, re.MULTILINE)

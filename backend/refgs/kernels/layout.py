@@ -35,11 +35,11 @@ class Work(ctypes.Structure):
 
 
 def struct(name: str, source: str) -> type[Work]:
-    """Make a ctypes class like the C++ `struct name` that is declared in the file `source` or in a header that it includes.
+    """Make a ctypes class like the C++ struct `name`, which is declared in the file `source` or in a header that `source` includes.
 
-    Only the lines before the first empty line of the struct are read. Functions of the struct come after it. Fields must be numbers,
-    structs, pointers or arrays. An array's length is an integer, or an integer constant of the same file. Raises ValueError for any other
-    field, or if the struct is not found.
+    Only the lines before the first empty line of the struct are read. Below this line, the struct has its functions. Fields must be
+    numbers, structs, pointers or arrays. An array's length is an integer, or an integer constant of the same file. Raises ValueError for
+    any other field, or if the struct is not found.
     """
     if made := _made(name, source):
         return made

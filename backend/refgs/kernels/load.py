@@ -103,7 +103,8 @@ def on_gpu(tensor: torch.Tensor) -> bool:
 def check(**expected: tuple[torch.Tensor, tuple[int, ...]]) -> None:
     """Check tensors before kernels use them. Each argument is a pair: a tensor, and the shape that it must have.
 
-    Raises ValueError if a tensor has another shape, is not float32, or is not on the same device as the first: the CPU or a CUDA card.
+    All tensors must be float32, on the same device: the CPU or a CUDA card. Raises ValueError if a tensor has another type, shape or
+    device.
     """
     home = next(iter(expected.values()))[0].device
     for name, (tensor, shape) in expected.items():
@@ -150,8 +151,8 @@ def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0, most:
 def run(name: str, work: ctypes.Structure, like: torch.Tensor, items: int, scratch: int = 0) -> None:
     """Run the kernel `name` with the arguments in `work`, on the device of the tensor `like`.
 
-    `items` is how many parts the work has. On a card, each item has a thread. On the CPU, torch's threads share the items, and each thread
-    has temporary memory for `scratch` floats.
+    The work consists of `items` items. On a card, each item has a thread. On the CPU, torch's threads share the items, and each thread has
+    temporary memory for `scratch` floats.
     """
     if on_gpu(like):
         cuda.launch(name, work, like.device, max(1, -(-items // cuda.BLOCK)))

@@ -44,9 +44,9 @@ def pose_step(
 
     The pose is zero if the rendering is empty. The photo and the rendering's picture are sRGB-encoded. Both are first averaged over squares
     of `reduction` pixels. The pose minimises Σ w |photo − picture + ∇ · motion(pose)|² over the pixels and channels. motion(pose) is how
-    far the pose moves a pixel. ∇ is the mean of the gradients of picture and photo, by central differences. With this mean, the steps
-    converge faster than with the gradient of one of them (Benhimane and Malis 2004). The weight w is small where picture and photo differ
-    much.
+    far the pose moves a pixel. ∇ is the mean of the gradients of picture and photo, by central differences. Steps with this mean converge
+    faster than steps with the gradient of only the picture or the photo (Benhimane and Malis 2004). The weight w is small where picture and
+    photo differ much.
     """
     maps = [rendering.color.clamp(0, 1), photo, rendering.blended_depth[..., None], rendering.alpha[..., None]]
     color, photo, depths, alpha = (_reduced(value, reduction) for value in maps)
@@ -75,8 +75,8 @@ def _normal_equations(
 ) -> tuple[Tensor, Tensor]:
     """Return the matrix (6, 6) and the right side (6,) of a pose's normal equations, in float64.
 
-    Both are sums over the pixels at `rows` and `columns`. `maps` holds four maps: the gradient of the picture to the right and the one down
-    (H, W, 3), the difference photo − picture (H, W, 3), and the depth (H, W).
+    Both are sums over the pixels at `rows` and `columns`. `maps` holds four maps: the picture's horizontal gradient (H, W, 3), its vertical
+    gradient (H, W, 3), the difference photo − picture (H, W, 3), and the depth (H, W).
     """
     across, down, apart, depth = (value[rows, columns].double() for value in maps)
     x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy

@@ -41,11 +41,11 @@ class LinearLight:
     brightest = 1e8  # raw texel; beyond it, sums lose what is small
 
     def radiance(self, raw: Tensor) -> Tensor:
-        """Convert raw texels of the light, which training changes, to radiance."""
+        """Convert raw texels to radiance. Raw texels are the trained parameters of the light."""
         return torch.nn.functional.softplus(raw)
 
     def raw(self, radiance: float) -> float:
-        """Return the raw texel that `radiance()` would convert to this radiance."""
+        """Convert radiance to a raw texel. This is the inverse of `radiance()`."""
         return math.log(math.expm1(radiance))
 
     def encode(self, radiance: Tensor) -> Tensor:
@@ -96,9 +96,9 @@ class Method:
     - `light`: how the values of the light represent radiance
     - `draw`: a function that replaces deferred shading; it takes the arguments of `render`. None keeps deferred shading.
     - `unread`: names of the surfels' parameters that do not affect pictures. They are not trained.
-    - `constants`: parameters that have the same raw value for all surfels, {name: value}. They are not trained.
-    - `left_out`: the features of RefGS that the method lacks, as rows of needs.json. A row has three texts: "what" is left out, "why", and
-      what that has "saved".
+    - `constants`: parameters that are the same for all surfels, {name: value before the activation function}. They are not trained.
+    - `left_out`: the features of RefGS that the method lacks, as rows of needs.json. Each row has three texts: "what" names the feature,
+      "why" gives the reason, and "saved" says what leaving it out saves.
     """
 
     lit: bool = True

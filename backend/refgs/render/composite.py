@@ -23,8 +23,7 @@ Progress = Callable[[int, int], None]
 def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress: Progress) -> np.ndarray:
     """Composite the splats at points (N, 3) on a surface with unit normals (N, 3).
 
-    Returns (N, 8): base colour, metallic, roughness, unit normal. If the splats have a doubt (how little photos tell metal from paint), it
-    follows as a ninth column.
+    Returns (N, 8): base colour, metallic, roughness, unit normal. If `splats.doubt` is given, it is composited into a ninth column.
 
     At each point a ray looks at the surface from outside, along the reversed normal. Splats are composited front to back if they are near
     the surface and face outwards. A splat's alpha is its opacity times its Gaussian where the ray meets the splat's plane. The result is
@@ -69,7 +68,7 @@ def blended_normals(splats: Splats) -> np.ndarray:
 
 
 def _outward(splats: Splats) -> np.ndarray:
-    """Return the learned normals (N, 3) of the splats' planes, flipped to the side to which `splats.normals` point."""
+    """Return the unit normals (N, 3) of the splats' planes. Each points to the same side of its plane as the normal in `splats.normals`."""
     plane = axes(torch.from_numpy(splats.rotations))[2].numpy()
     return np.where((plane * splats.normals).sum(axis=1, keepdims=True) < 0, -plane, plane)
 

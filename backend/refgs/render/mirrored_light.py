@@ -23,10 +23,11 @@ def mirrored_light(
 ) -> Tensor:
     """Return a weight for each texel of the light (6·R²,), where R is the cubemap's side. The weights sum to one.
 
-    The weight is proportional to the number of pixels in which the cameras see the texel's surroundings mirrored in the object. It is used
-    for the mean of the light, which a loss keeps grey. If all texels had equal weights, the light could get wrong colours in directions
-    that few pixels mirror, only to make the mean grey. If no texel is mirrored, all texels are weighted by their solid angles. Surfels
-    nearer to a camera than `near` are not drawn.
+    The weight is proportional to the number of pixels, in all cameras, that mirror the light around the texel. If no pixel mirrors the
+    light, the weights are proportional to the texels' solid angles. Surfels nearer to a camera than `near` are not drawn.
+
+    A term of the loss pulls the weighted mean of the light towards grey. With equal weights, this term could give wrong colours to the
+    light in directions that few pixels mirror.
     """
     pixels = torch.zeros(6 * SIDE * SIDE)
     settings = settings.model_copy(update={"reflection": "microfacet"})  # treat matte surfaces as reflective here

@@ -9,10 +9,11 @@ from refgs.camera import Camera
 
 
 class Scene:
-    """Fill in the arguments that the kernels of both rasterisers read: CPU and CUDA.
+    """Set the arguments that the CPU and CUDA rasterisers have in common.
 
-    This is a mixin. Each rasteriser has a class `Raster` that derives from its C struct of arguments and from `Scene`. It adds three
-    methods, called in this order: `project` finds the splats of each tile, `blend` draws them, `differentiate` computes the gradients.
+    This is a mixin. Each rasteriser has a class `Raster`, which derives from `Scene` and from the C struct of the kernels' arguments.
+    `Raster` adds three methods, called in this order: `project` finds the splats of each tile, `blend` draws them, `differentiate` computes
+    the gradients.
     """
 
     view: ctypes.Array

@@ -34,7 +34,8 @@ class Raster(NamedTuple):
 def _draw(splats: dict[str, Tensor], camera: Camera, near: float, *trim: float) -> tuple[Scene, Raster]:
     """Rasterise a dict of tensors, named as the arguments of `rasterize`.
 
-    Returns the kernels' arguments, for the backward pass, and the maps. `trim` is empty, or the two limits of `trimmed_depth`.
+    Returns two objects: the kernels' arguments, which the backward pass needs, and the maps. `trim` is empty, or holds `upper` and `lower`
+    as in `trimmed_depth`.
     """
     features = splats["features"]
     rasteriser = raster_cuda if load.on_gpu(features) else raster_cpu
@@ -148,9 +149,9 @@ def trimmed_depth(
 ) -> tuple[Tensor, Tensor]:
     """Compute the depth (H, W) of the surface along the camera's axis, and alpha (H, W). Not differentiable.
 
-    The depth is the mean over those surfels of a pixel through which the ray's transmittance falls from `upper` to `lower` (1 ≥ upper >
-    lower ≥ 0). So faint surfels in front of the surface do not count, nor do surfels behind it. The depth is 0 where the transmittance
-    stays above `upper`. With limits close to 0.5, it is nearly the median depth, which 2DGS uses for unbounded scenes.
+    The depth is a weighted mean over some surfels of the pixel: those that lower the ray's transmittance from `upper` to `lower` (1 ≥ upper
+    > lower ≥ 0). So neither faint surfels in front of the surface nor surfels behind it count. The depth is 0 where the transmittance stays
+    above `upper`. With limits close to 0.5, it is nearly the median depth, which 2DGS uses for unbounded scenes.
 
     The other arguments are those of `rasterize`.
     """

@@ -183,7 +183,8 @@ def radiance_towards(
     - `maps` (P, 8 or more): normal, albedo, metallic, roughness; with `indirect` also irradiance divided by that of an unoccluded surface
     - `appearance` (P, 3): a colour that replaces diffuse shading, or None
     - `levels`, `sides`: the prefiltered light. `turn` (3, 3) rotates directions from the world's axes to the light's.
-    - `indirect`: 1 where the mirror direction is unoccluded, else 0 (P, 1), and the radiance from the object there (P, 3); or None
+    - `indirect`: None, or two tensors for the mirror direction. The first (P, 1) is 0 where the object occludes the direction, else 1. The
+      second (P, 3) is the radiance that comes from the object in this direction.
     - `margins`: a list, to which distances from jumps of the derivatives are appended (see `shade`)
     - `mirror`, `matte`: as in `refgs.render.shade.shade`
     """

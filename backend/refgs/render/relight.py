@@ -132,8 +132,11 @@ class Transport:
     def chunks(self):
         """Split the surfels into chunks, so that large arrays are needed for only one chunk at a time.
 
-        Yields for each chunk a slice that selects its surfels, a slice that selects their rays, and for each ray the index of its surfel in
-        the chunk. The rays are only those that hit the mesh.
+        Yields three values for each chunk:
+
+        - a slice that selects the chunk's surfels
+        - a slice that selects the rays from these surfels that hit the mesh
+        - for each of these rays, the index of its surfel in the chunk
         """
         for start in range(0, len(self.normals), CHUNK):
             end = min(start + CHUNK, len(self.normals))
@@ -176,7 +179,7 @@ def received(surfels: Surfels, occluder: Occluder, light: Environment) -> Tensor
     """Compute each surfel's irradiance divided by the irradiance of an unoccluded surface: (N, 3).
 
     The irradiance includes the object's shadows and the light that the object reflects onto itself. The surfels' normals may point inward
-    or outward. For speed, rays are traced from a random subset of the surfels. The others interpolate the result.
+    or outward. For speed, rays are traced from a random subset of the surfels, and the result is interpolated to all surfels.
     """
     mesh, positions = occluder.mesh, surfels.positions.double().numpy()
     near = cKDTree(mesh.vertices).query(positions)[1]
@@ -235,11 +238,11 @@ def _gather(transport: Transport, light: Environment, bounces: int) -> tuple[Ten
 def _first(transport: Transport, rays: slice, levels: Tensor, sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
     """Shade the points where `rays` (a slice of all rays) hit the mesh, by the environment alone.
 
-    Returns three arrays (P, 3) for the P rays:
+    Returns three arrays (P, 3) for the P points:
 
     - environment light that the point mirrors back along the ray; zero where the object occludes the point's mirror direction
-    - specular reflectance of the point, for light from the object; zero where its mirror direction is not occluded
-    - diffuse reflectance of the point; multiply it by irradiance / π
+    - specular reflectance for light that comes from the object; zero where the object does not occlude the point's mirror direction
+    - diffuse reflectance; multiply it by irradiance / π
     """
     vertex, ray, free = transport.vertex[rays], transport.directions[transport.direction[rays]], transport.free[rays]
     albedo, metallic, roughness = transport.material[vertex].split((3, 1, 1), dim=1)

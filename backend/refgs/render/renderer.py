@@ -67,8 +67,8 @@ def render(
     `background` (3,) is sRGB-encoded. `near`, the smallest depth that is drawn, is in world units. `exposure` (3,) multiplies red, green
     and blue radiance before it is encoded.
 
-    `occluder` is the object's mesh, for reflections of the object in itself. Where it blocks a pixel's mirror direction, the pixel reflects
-    radiance that comes from the object, which the surfels store (Ref-Gaussian paper, Eq. 9). Otherwise it reflects `environment`.
+    `occluder` is the object's mesh, for reflections of the object in itself. Where the mesh blocks a pixel's mirror direction, the pixel
+    reflects radiance from the object. The surfels store this radiance (Ref-Gaussian paper, Eq. 9). Other pixels reflect `environment`.
 
     If the setting diffuse is "irradiance", `surfels.sh_rest` may hold a residual: a view-dependent colour, sRGB-encoded, that is added to
     the picture. It stands for what material and light cannot explain in the photos.

@@ -54,8 +54,8 @@ class _Work(struct("Shade", "pixels.h")):
 class _Padding(NamedTuple):
     """Hold index tables for cubemaps whose faces get a border one texel wide, so that bilinear look-up has no seams.
 
-    A cell is an entry of a face with its border; a line is a row of cells. Several cells can hold the same texel. Texels are in orbit order
-    (`cubemap.orbit_order`).
+    Each position of a face with its border is a cell. A row of cells is a line. Several cells can hold the same texel, because borders are
+    copies. Texels are in orbit order (`cubemap.orbit_order`).
 
     - `texel`: the texel that each cell holds
     - `cell`, `starts`: the cells that hold texel i are `cell[starts[i] : starts[i + 1]]`
@@ -162,7 +162,7 @@ def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor
     """Compute the mirror direction of each pixel (H, W, 3): the viewing direction reflected at the blended normal. No gradients.
 
     `shade` looks up the light in these directions. They are unit vectors in world space, and zero where nothing is. `features` (H, W, 17)
-    and `alpha` (H, W) are those that `shade` takes if it is also given `visibility`. Raises ValueError for features of another shape.
+    and `alpha` (H, W) are the same as for `shade` with `visibility`. Raises ValueError for features of another shape.
     """
     if features.shape != (*alpha.shape, CHANNELS + INDIRECT):
         raise ValueError(f"expected {CHANNELS + INDIRECT} features a pixel, got {tuple(features.shape)}")
@@ -199,7 +199,7 @@ def shade(
     The other arguments change the shading:
 
     - `visibility` (H, W): 0 where the object occludes the mirror direction, else 1; values between are allowed
-    - `exposure` (3,), default 1: factors of red, green and blue radiance, before it is encoded
+    - `exposure` (3,), default 1: factors that multiply red, green and blue radiance before it is encoded
     - `display`: light and materials are display values in 0..1, so nothing is encoded
     - `mirror`: reflections are a sharp mirror image of the light, weighted by metallic (Ye et al., 3DGS-DR, 2024)
     - `matte`: `features` are normal and albedo only. The picture is albedo · irradiance / π, and its material has metallic 0, roughness 1.
@@ -207,7 +207,7 @@ def shade(
     Blending biases normals towards the camera. This bias is removed first, by means of the position (see kernels/blended.h).
 
     All tensors are float32, on the CPU or on one CUDA card. Differentiable in `features`, `alpha`, the light and `exposure`. Results do not
-    depend on the number of threads. A card returns the same bits each time; if any of its derivatives is not finite, all are NaN.
+    depend on the number of threads. A card returns the same bits each time. If any derivative is not finite, a card makes all NaN.
     """
     expected = MATTE if matte else CHANNELS + (3 * by_direction if visibility is None else INDIRECT)
     if features.shape != (*alpha.shape, expected):

@@ -1,4 +1,4 @@
-"""Sum images over each surfel's pixels, weighted by how much the surfel contributes to a pixel: its blending weight."""
+"""Sum images over the pixels of each surfel. A pixel is weighted by the surfel's blending weight in this pixel."""
 
 from collections.abc import Callable, Iterable
 
