@@ -92,8 +92,8 @@ def train(asked: Asked, report: Report, attend: "Callable[[State], bool]") -> "t
 def unfinished(asked: Asked) -> bool | None:
     """Tell whether `refgs train --once` must start a training, resume it, or do nothing.
 
-    Returns False to start it, True to resume it, None if it has ended. Raises InputError if its run folder holds a training with other
-    settings than those asked for, and TryAgain if another process works in it.
+    Returns False to start it, True to resume it, None if it has ended. Raises InputError if the run folder holds a training with other
+    settings than those asked for. Raises TryAgain if another process works in this folder.
     """
     out = asked.out
     if not (out / "run.toml").exists():

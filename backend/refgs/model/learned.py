@@ -38,9 +38,9 @@ class Moments:
 class Learned(Mapping[str, Tensor]):
     """Hold the tensors that a training learns, by name, with Adam's moments, learning rates and limits.
 
-    A tensor that has one row for each surfel is called "by row". The light's texels are not. The rows of all tensors by row are
-    replaced together (see `rows`). A tensor by row may get no gradient, such as a mask: its rows are replaced as well, but Adam does not
-    change it. `constant` holds the tensors by row that no longer learn, each with one row that all surfels share.
+    A tensor that has one row for each surfel is called "by row". The light's texels are not. The rows of all tensors by row are replaced
+    together (see `rows`). This includes tensors that get no gradient, such as masks, which Adam does not change. `constant` holds the
+    tensors by row that no longer learn, each with one row that all surfels share.
 
     One kernel updates all tensors with Adam (Kingma and Ba 2015). Elements whose gradient is zero keep their value and their moments. So a
     surfel that is not visible does not move. In the original Adam it would still move, because its moments decay slowly.
@@ -90,8 +90,8 @@ class Learned(Mapping[str, Tensor]):
     def learn(self, name: str, value: Tensor, by_row: bool = True) -> None:
         """Start to learn a tensor from the values in `value`, without moments.
 
-        `by_row` says that it has one row for each surfel. A tensor that has this name already is replaced. Its learning rate stays; that of
-        a new tensor is 0.
+        `by_row` says that it has one row for each surfel. If a tensor with this name exists, it is replaced, and its learning rate stays.
+        The learning rate of a new tensor is 0.
         """
         self._values[name] = _leaf(value)
         self.moments.pop(name, None)
@@ -117,8 +117,8 @@ class Learned(Mapping[str, Tensor]):
     def rows(self, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
         """Replace all surfels: new surfel i is a copy of old surfel `index`[i]. An index may occur more than once.
 
-        Moments are copied, too, but new surfels whose indices are in `fresh` start with zero moments. Adam then moves them faster than
-        others at first. Pictures get worse for a while, but for captures without masks, the final result is better. If memory runs out, all
+        Moments are copied, too, but new surfels whose indices are in `fresh` start with zero moments. Adam then moves these surfels faster
+        at first. This makes pictures worse for a while, but the final result is better for captures without masks. If memory runs out, all
         surfels stay as they were.
         """
         values = {name: _leaf(value.detach()[index]) for name, value in self.by_row.items()}
@@ -207,8 +207,8 @@ class Learned(Mapping[str, Tensor]):
         """Take over a checkpoint's values of the tensors that are learned or constant now.
 
         If a tensor by row is constant in the checkpoint but learned now, its one row is repeated for all surfels. If it is learned in the
-        checkpoint but constant now, its first row is taken. A learned tensor that is not by row is dropped if the checkpoint lacks it.
-        Raises KeyError if any other tensor is missing.
+        checkpoint but constant now, its first row is taken. Raises KeyError if the checkpoint lacks a tensor by row. Any other tensor that
+        it lacks, such as the light, is dropped.
         """
         rows = len(tensors["parameter.position"])
         self.moments.clear()

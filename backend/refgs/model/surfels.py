@@ -124,9 +124,9 @@ class _Activate(Function):
 def activate(p: Parameters) -> Surfels:
     """Apply the activation functions to the raw parameters `p` (see `Parameters`). Returns the surfels as they are rendered.
 
-    The activation of metallic gets closer to 0 and 1 than the logistic function. This matters for mirrors: at metallic 0.985, a mirror also
-    has a faint white diffuse reflection, as bright as the mirror image of a dark corner. Training then makes the light in this corner too
-    dark, to compensate.
+    The activation of metallic gets closer to 0 and 1 than the logistic function. This matters for mirrors: with a metallic value of 0.985,
+    a mirror also has a faint white diffuse reflection, as bright as the mirror image of a dark corner. Training then makes the light in
+    this corner too dark, to compensate.
     """
     scales, opacities, albedo, metallic, roughness = _Activate.apply(*(p[name] for name in _KINDS))
     return Surfels(
@@ -154,7 +154,7 @@ def quaternions_towards(normals: np.ndarray) -> np.ndarray:
 
 
 def raw_metallic(metallic: float) -> float:
-    """Return the raw parameter that the activation function turns into this metallic, which is between 0 and 1."""
+    """Return the raw parameter that the activation function turns into this metallic value, which lies between 0 and 1."""
     s = 0.5 - math.sin(math.asin(1 - 2 * metallic) / 3)  # 3 s² − 2 s³ = metallic
     return math.log(s / (1 - s))
 

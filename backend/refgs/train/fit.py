@@ -24,11 +24,11 @@ def fitting(
     """Make a trainer whose settings let the training end within `plan.minutes`.
 
     First, run a few iterations with the preset `quick` to measure how long an iteration takes. Then try settings from `quick` to beyond
-    `standard` (see `between`), and choose the most detailed ones whose iterations all fit. If none fit, choose `quick`. Finally,
-    set the number of iterations to as many as fit.
+    `standard` (see `between`), and choose the most detailed ones whose iterations all fit. If none fit, choose `quick`. Finally, set the
+    number of iterations to as many as fit.
 
-    If `quick` is chosen, the training continues after the measured iterations. Otherwise it starts anew. `effective` holds the
-    settings of `quick`, and `standard` those of that preset, both with the user's changes.
+    If `quick` is chosen, the training continues after the measured iterations. Otherwise it starts anew. `effective` holds the settings of
+    the preset `quick`, and `standard` those of the preset `standard`. Both include the user's changes.
     """
     quick, begun, said = effective.settings, plan.spent, []
     trainer = Trainer(capture, effective, folder, lambda *event: said.append(event), plan, device)
@@ -100,9 +100,9 @@ def between(quick: Settings, standard: Settings, part: float) -> Settings:
 def _scheduled(settings: Settings, iterations: float, quick: Settings, standard: Settings) -> Settings:
     """Set the number of iterations, and adapt the schedule and the learning rates to it.
 
-    The learning rates stay as they are if the number of iterations lies between that of `quick` and that of `standard`. Otherwise they are
-    multiplied by √(nearest number in this range / iterations), but never by more than FASTEST. Each step adds noise, because it uses only
-    one view. With this factor, the noise of all steps together stays about the same.
+    The learning rates stay as they are if the number of iterations lies between those of `quick` and `standard`. Otherwise they are
+    multiplied by √(n / iterations), where n is the nearer of these two numbers. The factor is at most FASTEST. It keeps the noise of all
+    steps together about the same. (Each step adds noise, because it uses only one view.)
     """
     tables, part = settings.model_dump(), iterations / settings.train.iterations
     usual = min(max(iterations, quick.train.iterations), standard.train.iterations)

@@ -28,7 +28,7 @@ MIRROR = {"albedo": 0.8, "roughness": 0.1}
 
 
 def continue_with_hints(state: State, run: Path, hints: list[Hint]) -> None:
-    """Load the last checkpoint of a finished `run`, go back to an earlier iteration, and keep the metallic of the hinted parts fixed.
+    """Load the last checkpoint of a finished `run`, go back to an earlier iteration, and fix the metallic values of the hinted parts.
 
     Hinted metals start as a bright mirror, because the base colour that they learned as plastic is of no use. Hinted paint keeps the base
     colour and roughness that it learned as metal, because rough metal looks much like paint of its colour. The residual (see
@@ -53,10 +53,10 @@ def continue_with_hints(state: State, run: Path, hints: list[Hint]) -> None:
 
 
 def hinted_kinds(state: State, splats: np.ndarray, hints: list[Hint]) -> torch.Tensor:
-    """Return what the hints say of each surfel (N,): the index in `KINDS` of "metal" or "paint", or −1 without a hint.
+    """Return what the hints say of each surfel (N,): 0 for metal and 1 for paint, as in `KINDS`, or −1 without a hint.
 
     `splats` (M, 3) are the positions of the run's splats. Each point of a hint marks the nearest splat. If several hints mark a splat, the
-    last one counts. Surfels take the kind of the nearest splat, because splats.ply has no rows for surfels that no photo shows.
+    last one counts. Each surfel takes the mark of the nearest splat, because splats.ply lacks the surfels that no photo shows.
     """
     tree, kinds = cKDTree(splats), np.full(len(splats), -1)
     for hint in hints:
@@ -68,8 +68,8 @@ def hinted_kinds(state: State, splats: np.ndarray, hints: list[Hint]) -> torch.T
 def _go_back(state: State) -> None:
     """Set the iteration to the fraction AGAIN of the total, and set the training's times to zero.
 
-    With a time limit, the total is chosen so that the remaining iterations fill the time that is left. Without a limit, AT_MOST
-    minutes become the limit if the remaining iterations would take longer.
+    Without a time limit, AT_MOST minutes become the limit if the remaining iterations would take longer. With a limit, the total is chosen
+    so that the remaining iterations fill the time that is left.
     """
     count, pace, plan = (1 - AGAIN) * state.total, state.seconds / max(state.iteration, 1), state.plan
     state.seconds = plan.before = 0.0

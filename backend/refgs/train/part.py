@@ -13,8 +13,8 @@ Fact = bool | int | Tensor
 class Part:
     """Hold what one task of a training remembers, such as aligning poses. `state.part(Kind)` returns the object of the subclass `Kind`.
 
-    `train/timeline.py` says when each task is done. A checkpoint stores the object's `facts` under its `name`: numbers in the TOML file,
-    and tensors. By default, the facts are the attributes named in `saved` that are not None.
+    `train/timeline.py` says when each task is done. A checkpoint stores the object's `facts`, numbers and tensors, under its `name`. By
+    default, the facts are the attributes named in `saved` that are not None.
     """
 
     name: ClassVar[str]

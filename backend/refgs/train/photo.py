@@ -18,8 +18,8 @@ Crop = tuple[slice, slice]
 class Photo(NamedTuple):
     """Hold a view's photo on the training's device.
 
-    - `image` (H, W, 3): integer codes of sRGB values, uint8 or uint16. The code `white` stands for the value 1. The dtype's largest code
-      stands for its own value and for all brighter ones.
+    - `image` (H, W, 3): sRGB values as integers, uint8 or uint16. The integer `white` stands for the value 1. The dtype's largest integer
+      stands for its own value, and for all brighter values.
     - `mask` (H, W): how much of each pixel the object covers, as uint8 from 0 to 255. None if the photo has no mask.
     - `whole` (H, W): the size of the whole photo if this is a crop. Beyond the crop, the whole photo is background.
     """
@@ -57,12 +57,12 @@ class Photo(NamedTuple):
 
     @property
     def clipped(self) -> Tensor:
-        """Tell which channels of the pixels are clipped, bool (H, W, 3). Codes just below the largest count, too: JPEG changes codes."""
+        """Tell which channels are clipped, bool (H, W, 3). This includes values just below the largest one, because JPEG changes values."""
         return self.image.float() >= torch.iinfo(self.image.dtype).max // 255 * 254
 
 
 def crop_of(view: LoadedView, margin: int) -> Crop:
-    """Return the crop that shows the object: the bounds of the photo's mask plus `margin` pixels, or the whole photo without a mask."""
+    """Return the crop that shows the object: the bounds of the photo's mask plus `margin` pixels. Without a mask: the whole photo."""
     height, width = view.image.shape[:2]
     return (slice(0, height), slice(0, width)) if view.alpha is None else bounds(view.alpha, margin)
 

@@ -30,8 +30,7 @@ def iterations_time(growth: float, progress: float, stages: tuple[Stage, ...] = 
     """Compute how long all iterations up to a progress of 0..1 take together.
 
     The unit is the time that the whole training would take if each iteration were as fast as the first one on full photos. But iterations
-    slow down: the last takes `growth` times as long as the first, if both are on full photos. At a progress of 1, the result is at most
-    `growth`, and at least 1 if photos are not reduced.
+    slow down: the last takes `growth` times as long as the first, if both are on full photos.
     """
     first, last = GROWS
 

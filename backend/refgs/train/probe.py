@@ -111,7 +111,7 @@ def psnr_loss(state: State, change: Change, inputs: RenderInputs | None = None) 
 def _on_object(
     state: State, inputs: RenderInputs, views: list[int], pairs: Iterable[Sequence[Tensor]]
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Yield for each of the `views` the object's pixels (P, 3) in both pictures of its pair, and in the photo."""
+    """Yield three tensors (P, 3) for each of the `views`: the object's pixels in the view's two pictures of `pairs`, and in the photo."""
     for view, (one, other) in zip(views, pairs, strict=True):
         shown = on_object(state, inputs.surfels, view)
         yield one[shown], other[shown], state.photo(view).over(state.background)[shown]

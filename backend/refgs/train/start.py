@@ -17,7 +17,7 @@ FAINT = 0.1  # largest opacity of points that may not lie on the surface
 def start_parameters(
     capture: Capture, views: list[LoadedView], settings: Settings, hollows: bool = False
 ) -> tuple[Parameters, int, str]:
-    """Make the initial parameters of the surfels. `first_points` chooses their positions; with `hollows`, it first carves the hull.
+    """Make the initial parameters of the surfels. `first_points` chooses their positions; `hollows` is passed on to it.
 
     Returns the parameters, the number of surfels on the visual hull, and a message for the user that says where the surfels start. Surfels
     on the hull come first. Without a hull, the number is that of all surfels.

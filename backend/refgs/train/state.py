@@ -129,7 +129,7 @@ class State:
         return weights
 
     def surfels(self) -> Surfels:
-        """Compute the surfels from their raw parameters. A parameter that does not learn has one value for all surfels."""
+        """Compute the surfels from raw parameters (before activation). A parameter that does not learn has one value for all surfels."""
         count = self.learned.count
         values = activate(self.learned.by_row | self.learned.constant)
         if self.method.lit and self.settings.render.diffuse == "irradiance" and not self.residual:
@@ -137,7 +137,7 @@ class State:
         return Surfels(*(v if len(v) == count else v.expand(count, *v.shape[1:]) for v in values))
 
     def environment(self) -> Environment | None:
-        """Make the light from its raw texels. Return None if the rendering method uses no light."""
+        """Make the light from its raw texels (before activation). Return None if the rendering method uses no light."""
         if not self.method.lit:
             return None
         reference = self.views[0].camera if self.settings.light.frame == "camera" else None

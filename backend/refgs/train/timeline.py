@@ -1,7 +1,7 @@
 """Tell when each action of a training is done. Each action has one `Row`.
 
 `Trainer.step` does what is due in BEFORE, renders a photo and takes a step of Adam, and then does what is due in AFTER.
-`scripts/timeline_page.py` prints all rows into docs/timeline.md. No other module of the training compares its progress with a threshold.
+`scripts/timeline_page.py` prints all rows into docs/timeline.md. No other module compares the training's progress with a threshold.
 
 A training's progress is the fraction of its iterations that are done, 0..1.
 """
@@ -135,15 +135,15 @@ def iterations(count: int) -> Every:
 def decidable(state: State, done: int) -> bool:
     """Tell whether surfels, materials and light can be judged after `done` iterations.
 
-    They cannot if the method does not shade pixels by materials, in the initial stage (see `start_deferred`), or while surfels are faint
-    after an opacity reset.
+    For this, the method must shade pixels by materials, the initial stage (see `start_deferred`) must be over, and surfels must no longer
+    be faint after an opacity reset.
     """
     by_pixels = state.method.deferred and state.settings.render.diffuse == "irradiance"
     return by_pixels and not state.initial and not faint_now(state, done)
 
 
 def metals_decidable(state: State, done: int) -> bool:
-    """Tell whether photos can show what is metal: `decidable` must hold, `reflection` be "microfacet", and normals not be propagated."""
+    """Tell whether photos can show what is metal. This needs `decidable`, `reflection` "microfacet", and no propagation of normals."""
     settings = state.settings
     return settings.render.reflection == "microfacet" and not settings.propagation.every and decidable(state, done)
 

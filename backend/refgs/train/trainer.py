@@ -223,7 +223,7 @@ class Trainer:
         del self.measures
 
     def resume(self) -> None:
-        """Resume from the last complete, undamaged checkpoint. Without one, raise NoCheckpoint, but at iteration 0 do nothing."""
+        """Resume from the last complete, undamaged checkpoint. Without one, do nothing at iteration 0, and raise NoCheckpoint later."""
         try:
             snapshot.restore(self.state, self.state.folder)
         except checkpoint.NoCheckpoint:

@@ -37,8 +37,8 @@ class Reflections(Need):
         """Decide by two measurements whether inter-reflection is needed.
 
         The first is `given.hidden`, the fraction of the object's pixels that mirror the object itself. The second is how many dB of PSNR
-        inter-reflection can gain at most. Inter-reflection is needed if both reach their thresholds over the whole object. If a small part
-        gains much, a smaller fraction suffices. Nothing is measured if the user's setting is "off".
+        inter-reflection can gain at most. Inter-reflection is needed if both values reach their thresholds. If it gains much in a small
+        part of the object, the threshold of the first value is lower. Nothing is measured if the user's setting is "off".
         """
         if self.asked(state) == "off":
             return Decision(False, ASKED)
@@ -68,7 +68,7 @@ class Reflections(Need):
 
 
 def share_hidden(hidden: float) -> str:
-    """Return a message for the user: on how many percent of its pixels the object mirrors itself. `hidden` is this number as 0..1."""
+    """Return a message for the user from `hidden`, the fraction (0..1) of the object's pixels in which the object mirrors itself."""
     return f"the object mirrors itself on {hidden:.1%} of it"
 
 
@@ -127,8 +127,8 @@ class Light(Need):
 def resolvable(roughness: float, part: float, finest: int, coarsest: int) -> int:
     """Return the lowest cubemap resolution, in texels along a side, that still shows reflections of a surface with this roughness.
 
-    The result lies between `coarsest` and `finest`. A texel may take at most the fraction `part` of the width of the reflection's lobe,
-    which is roughness² radians.
+    The result lies between `coarsest` and `finest`. A texel may be at most `part` times as wide as the reflection's lobe, which is
+    roughness² radians wide.
     """
     side = coarsest
     while side < finest and math.pi / 2 / side > part * roughness**2:

@@ -22,7 +22,7 @@ INDIRECT = "indirect_dc", "indirect_rest", "received"
 
 
 class Specular(Need):
-    """Decide whether the scene needs specular shading, with metallic, roughness and inter-reflection. A matte scene does not."""
+    """Decide whether the scene needs specular shading, which includes metallic, roughness and inter-reflection. A matte scene does not."""
 
     name, what = "specular", "specular shading"
     threshold = 0.3  # dB
@@ -115,8 +115,8 @@ class Constants(Need):
     def common(self, state: State, surfels: Surfels, kept: Tensor) -> dict[str, tuple[float, float]]:
         """Find out which of metallic and roughness have about the same value for all surfels that the mask `kept` (N,) selects.
 
-        Returns (common value, width of the range of values) of each, by name. If the user's setting is "off", both are returned, however
-        wide their ranges are. If it is "on", none is.
+        Returns a dict: the name gives (common value, width of the range of values). If the user's setting is "off", the dict has both
+        names, however wide the ranges are. If the setting is "on", the dict is empty.
         """
         if self.asked(state) == "on" or not state.method.lit:
             return {}

@@ -41,11 +41,11 @@ class Decision(NamedTuple):
 
 
 class Given(NamedTuple):
-    """Hold what is measured before `Need.measure` is called, for its use.
+    """Hold values that are measured beforehand, and passed to `Need.measure`.
 
     - `done`: how many iterations are done.
     - `hidden`: the fraction of the object's pixels that mirror the object.
-    - `common`: {"metallic" or "roughness": (common value, width of the range)}, if nearly equal in all surfels of splats.ply.
+    - `common`: which of metallic and roughness have about the same value in all surfels of splats.ply (see `Constants.common`).
     - `kept`: the number of surfels in splats.ply.
     """
 

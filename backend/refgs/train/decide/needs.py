@@ -50,9 +50,9 @@ def look_again(state: State, step: Step) -> None:
 
 
 def bring_back_specular(state: State, why: str) -> bool:
-    """Bring back specular shading and what was left out with it. Returns False, without a change, if it is on or the user turned it off.
+    """Bring back specular shading and what was left out with it. `why` is the reason, for the record.
 
-    `why` is the reason, for the record.
+    Returns False, and changes nothing, if specular shading is on already, or if the user's setting is not "auto".
     """
     if state.needed(SPECULAR.name) or SPECULAR.asked(state) != "auto":
         return False
@@ -79,7 +79,7 @@ def _undo_following(state: State, decisions: dict[str, Found], why: str) -> None
 
 
 def reflections(state: State, step: Step) -> None:
-    """Decide with a new mesh whether the scene needs inter-reflection. Once decided, only report how much of the object mirrors itself."""
+    """Decide with a new mesh whether inter-reflection is needed. If this was decided before, report how much the object mirrors itself."""
     hidden = step.hidden or 0.0
     if not evaluate(state, "mesh", Given(step.done, hidden)):
         state.announce("reflections", f"with {Reflections.what}: {share_hidden(hidden)}")

@@ -16,8 +16,8 @@ LEAST_GROWTH = 2  # even the smallest object may get this many times the surfels
 class ObjectSize(NamedTuple):
     """Hold the object's size in pixels of the photos as loaded: medians over views. Both values are 0 if a photo has no mask.
 
-    `span` is the longer side of a mask's bounds, and `area` is the number of pixels in the mask. If the user set a region to train, the
-    ball around it is seen as a circle in the photo: `span` is at most its diameter, and `area` its area.
+    `span` is the longer side of the mask's bounds, and `area` is the number of pixels in the mask. If the user set a region to train, the
+    photo shows the ball around it as a circle. Then `span` is at most the circle's diameter, and `area` at most the circle's area.
     """
 
     span: float
@@ -43,9 +43,9 @@ def object_size(state: State) -> ObjectSize:
 
 
 def surfel_budget(settings: SurfelSettings, area: float) -> int:
-    """Return how many surfels an object of `area` pixels may get: `density` a pixel, from LEAST_GROWTH · `start` to `budget`.
+    """Return how many surfels an object of `area` pixels may get: `density` surfels a pixel.
 
-    If `density` is 0, it is `budget`.
+    The number is at least LEAST_GROWTH · `start`, but never above `budget`. If `density` is 0, the number is `budget`.
     """
     if settings.density == 0:
         return settings.budget

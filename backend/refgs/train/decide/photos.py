@@ -68,7 +68,7 @@ def time_crops(state: State, step: Step) -> None:
 
 
 def duplicate_views(views: list[LoadedView], radius: float) -> list[int]:
-    """Return the indices of views that duplicate an earlier view. `radius` is the object's (see `motion`).
+    """Return the indices of views that duplicate an earlier view. `radius` is the object's radius in world units.
 
     A view is a duplicate if points of the object move by less than ALIKE_PIXELS between the two photos, and the photos look the same.
     """

@@ -1,6 +1,6 @@
-"""Write a training view as rendered with a feature and without it, when a training decides whether the scene needs this feature.
+"""Write pictures for the decision whether the scene needs a feature: a training view with the feature, and without it.
 
-The pictures show the artist what a decision of `refgs.train.decide.needs` is about. They are in the run folder, in `needs/`.
+The pictures show the artist what such a decision (see `refgs.train.decide.needs`) is about. They are in the run folder, in `needs/`.
 """
 
 import math
@@ -26,10 +26,11 @@ Pair = Callable[[State, Found, list[int]], Iterator[tuple[Tensor, Tensor]]]
 
 @torch.no_grad()
 def write_pictures(state: State, name: str, found: Found) -> Pictures | None:
-    """Write three pictures of a view: rendered with an optional part of the training, without this part, and the photo.
+    """Write three pictures of a view: rendered with an optional part of the training, rendered without this part, and the photo.
 
-    `name` is that of the part in `refgs.train.decide.needs`, and `found` the decision about it. The view is the one whose two renderings
-    differ most. Returns its name, the files' paths in the run folder, and the PSNR of both renderings in dB; None if there is no picture.
+    `name` is the part's name in `refgs.train.decide.needs`, and `found` is the decision about it. The view is the one whose two renderings
+    differ most. Returns the view's name, the pictures' paths in the run folder, and the PSNR of both renderings in dB. Returns None if no
+    pictures were written.
     """
     if name not in PAIRS:
         return None
@@ -68,9 +69,9 @@ def _specular(state: State, found: Found, views: list[int]) -> Iterator[tuple[Te
 
 
 def _reflections(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render each view twice: mirror rays that hit the object return its mean radiance first, and the environment's light second.
+    """Render each view twice, with two guesses of what a mirror ray sees where it hits the object. Yields nothing without a mesh.
 
-    Both are guesses: what these rays see is not known before they are traced. Yields nothing without a mesh.
+    The first guess is the object's mean radiance, the second is the environment's light. Only tracing would show what the ray sees.
     """
     inputs = state.inputs()
     if inputs.occluder is None:

@@ -1,4 +1,4 @@
-"""Measure ambiguities: pairs of changes to light or materials that cancel in all pictures, so that photos cannot rule them out."""
+"""Measure ambiguities: pairs of changes to light or materials. Together, the two changes of a pair may leave all pictures as they are."""
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -30,9 +30,9 @@ def _redder(old: Explanation, size: float) -> Explanation:
 
 
 def _blurred(old: Explanation, size: float) -> Explanation:
-    """Return `old` with a blurred environment: each texel is blended with the mean of the texels around it, which has the weight `size`.
+    """Return `old` with a blurred environment: each texel is blended with the mean of the texels around it.
 
-    The mean is over a square on the same cubemap face. It reaches a sixteenth of the face's side in each direction, but at least one texel.
+    `size` is the weight of this mean. The texels around are those on the same face, up to a sixteenth of the face's side away.
     """
     side = round((len(old[1]) // 6) ** 0.5)
     faces = old[1].view(6, side, side, 3).permute(0, 3, 1, 2)
@@ -62,8 +62,8 @@ def _more_metal(old: Explanation, size: float) -> Explanation:
 class Trade(NamedTuple):
     """Hold two changes of the scene that may cancel in the pictures, such as a brighter light and a darker base colour.
 
-    The function `change` makes the first change, with the strength `size`. The function `made_up` makes the second one, with any strength.
-    Two texts are for the user: `words` describes the first change, and `answer` names what the second one alters.
+    The function `change` makes the first change, with the strength `size`. The function `made_up` makes the second change, with any
+    strength. Two texts are for the user: `words` describes the first change, and `answer` names what the second change alters.
     """
 
     words: str

@@ -36,8 +36,8 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
 
     These are the surfels (splats.ply), the light (environment.exr), and the optional features that the training left out or kept
     (needs.json). If inter-reflection was traced, the object's mesh is written to occluder.ply. If exposures or poses were learned,
-    cameras.json is written again to include them. If the training decides from the photos what is metal, splats.ply also has each surfel's
-    doubt (0..1: how little photos tell metal from paint), and metrics.json the fraction of the surface with a doubt of at least 0.5.
+    cameras.json is written again to include them. If photos decide what is metal, each surfel's doubt is added to splats.ply, and facts
+    about it to metrics.json (see `metals.doubt`).
 
     splats.ply is written last, because a run that has it counts as finished. `before_splats` is called just before. Raises InputError if
     the photos show no surfel in the region to train.
@@ -86,8 +86,8 @@ def _with_relightable_albedo(surfels: Surfels, state: State) -> Surfels:
 
     Programs that light the surfels use the albedo. Programs that display the surfels without lighting use the SH colours.
 
-    If the training learned diffuse colour as SH, compute the albedo: the mean SH colour divided by the irradiance, or for metals the
-    learned reflectance. If the training learned the albedo, compute the SH colour: the albedo times the irradiance.
+    If the training learned diffuse colour as SH, the albedo is computed: the mean SH colour divided by the irradiance. Metals take the
+    learned reflectance instead. If the training learned the albedo, the SH colour is computed: the albedo times the irradiance.
     """
     environment = state.environment()
     if environment is None:
@@ -107,10 +107,10 @@ REWRITES = (_without_unlearned, _without_untraced, _with_relightable_albedo)
 
 
 def _with_constants(surfels: Surfels, state: State, kept: Tensor) -> tuple[Surfels, dict[str, float]]:
-    """Give all surfels the same metallic or roughness if theirs are nearly equal. Return the surfels, and these values by name.
+    """Find out which of metallic and roughness are nearly equal in all surfels, and make these exactly equal.
 
-    splats.ply then needs no column for them. Only surfels whose entry in `kept` (N,) is true are compared. Without specular shading, all
-    surfels get metallic 0 and roughness 1, and the values include specular 0.
+    splats.ply then needs no column for them. Returns the surfels, and the common values by name. Only surfels whose entry in `kept` (N,) is
+    true are compared. Without specular shading, all surfels get metallic 0 and roughness 1, and the values include specular 0.
     """
     if state.settings.render.reflection == "none" and state.method.lit:
         constants = {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}

@@ -103,7 +103,7 @@ def _files(folder: Path, iteration: int) -> tuple[Path, Path]:
 
 
 def _read(folder: Path, iteration: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read the tensors of a checkpoint, and the values in its TOML file. Raises any of the errors that `load` catches if it is damaged."""
+    """Read the tensors of a checkpoint, and the values in its TOML file. If it is damaged, raise one of the errors that `load` catches."""
     data, note = _files(folder, iteration)
     whole_text = read_text(note, "").replace("\r\n", "\n")  # with the line ends that were hashed
     head, _, text = whole_text.partition("\n")

@@ -19,7 +19,7 @@ RENAMED = {
 def as_of_today(tensors: dict[str, Tensor], facts: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Convert the tensors and facts of a checkpoint of release 0.1.0 to the present form. Return those of later releases unchanged.
 
-    0.1.0 had no mask `held`: a metallic with a value in HELD was not learned. It stored the facts of all parts (see `Part`) in one table.
+    0.1.0 had no mask `held`: surfels with a metallic value in HELD did not learn it. All parts (see `Part`) shared one table of facts.
     """
     if "residual" in facts:
         return tensors, facts

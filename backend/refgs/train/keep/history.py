@@ -36,7 +36,7 @@ def allowed(iteration: int, total: int, seconds: float) -> float:
 def record(state: State, measures: Measures) -> None:
     """Add a line about the training's present state to the history, and report it as the event "measured".
 
-    Errors against held-out photos and ground truth are measured if there is time for it (see `allowed`), and at the training's end.
+    Errors against held-out photos and ground truth are measured at the training's end, and earlier if there is time (see `allowed`).
     """
     means = state.part(Means)
     limit = math.inf if state.ended else allowed(state.iteration, state.total, state.seconds)

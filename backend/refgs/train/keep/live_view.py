@@ -16,7 +16,7 @@ def write_preview(state: State) -> dict[str, str | int]:
     """Write the present surfels to RUN/preview/splats.ply, and a picture of them to RUN/preview/view.png.
 
     The picture is of the first held-out view, or of the first training view if there is none. Surfels outside the region to train are left
-    out. Each file is written whole or not at all. Returns the paths, `splats` and `view`, and the `iteration`.
+    out. Each file is written whole or not at all. Returns a dict of the paths `splats` and `view`, and of the `iteration`.
     """
     folder = state.folder / PREVIEW
     view = (state.test or state.views)[0]

@@ -84,7 +84,7 @@ class Measures:
         return _TestView(loaded, known, alpha, relit)
 
     def _read_lights(self, truth: GroundTruth, device: torch.device) -> None:
-        """Read two lights from the ground truth, if it has them: that of the photos, and another one under which it has true pictures."""
+        """Read the photos' light from the ground truth, and the other light under which it has true pictures. Either may be missing."""
         if not self._method.lit:
             return
         # Else the training's light turns with the camera, and the true one does not.

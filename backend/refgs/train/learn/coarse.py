@@ -21,8 +21,8 @@ LEAST_SPAN = 200  # pixels that the object must span in reduced photos
 class Coarse(Part):
     """Remember the training's stages, and the reduced photos of the present stage. Each stage has its own size of photos.
 
-    `photos` are the training photos with both sides divided by `factor`. `crops` are the parts of them that are trained on; None: all.
-    If `factor` is 1, both are unset, and `State.photos` are used.
+    `photos` are the training photos with both sides divided by `factor`. `crops` are the parts of them to train on, or None to train on all
+    of them. If `factor` is 1, `photos` is empty and `crops` is None, because `State.photos` are used.
     """
 
     name, saved = "coarse", ("factor",)
@@ -38,14 +38,14 @@ class Coarse(Part):
 
 
 def stages(pixels: float) -> tuple[Stage, ...]:
-    """Plan the stages for an object that spans `pixels` in the full photos. In reduced photos, it must span LEAST_SPAN pixels."""
+    """Plan the stages for an object that spans `pixels` in the full photos. In reduced photos, it must span at least LEAST_SPAN pixels."""
     return *(Stage(*stage) for stage in PHOTO_STAGES if pixels / stage[1] >= LEAST_SPAN), *FULL
 
 
 def begin(state: State, pixels: float, refined: bool) -> None:
     """Choose the stages for an object that spans `pixels` in the full photos, and start with the first one.
 
-    If poses are `refined`, no stage with reduced photos lasts beyond the progress POSES_KNOWN, because poses are judged at that time.
+    `refined` tells whether poses are refined. If so, stages of reduced photos that last beyond the progress POSES_KNOWN are left out.
     """
     if state.settings.image.coarse == "off":
         return

@@ -17,7 +17,7 @@ BALANCED = 0.1  # largest difference of a channel's logarithm that may still be 
 
 
 class Exposures(Part):
-    """Hold `basis` (3, 3) on the training's device. Its rows, logarithms of RGB factors, change brightness, temperature and tint."""
+    """Hold `basis` (3, 3), the tensor of EXPOSURE. Its rows are logarithms of RGB factors, for brightness, temperature and tint."""
 
     name = "exposures"
 
@@ -28,9 +28,9 @@ class Exposures(Part):
 def exposure(state: State, view: int | slice) -> Tensor | None:
     """Return a view's exposure (3,): factors for its rendered red, green and blue. Return None if exposures are not learned.
 
-    The training learns up to three weights per view: for brightness, temperature and tint, the rows of EXPOSURE. The weighted sum of the
-    rows is the natural logarithm of the factors. If only the first weight is learned, a view's three factors are equal: all photos have
-    the same white balance. If `view` is a slice, the result has a row for each of its views (V, 3).
+    The training learns up to three weights per view, one for each row of EXPOSURE: brightness, temperature and tint. The weighted sum of
+    the rows is the natural logarithm of the factors. If only the first weight is learned, a view's three factors are equal, because all
+    photos have the same white balance. If `view` is a slice, the result has a row for each view in the slice (V, 3).
     """
     weights = state.learned.get("exposure")
     return None if weights is None else (weights[view] @ state.part(Exposures).basis[: weights.shape[1]]).exp()
@@ -46,7 +46,7 @@ def balance(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def leave_out_alike(state: State, step: Step) -> None:
-    """Stop learning exposures, or only white balances, if those of all photos are nearly equal and `light.exposure` is "auto"."""
+    """If `light.exposure` is "auto", stop learning exposures or white balances that are nearly equal in all photos."""
     exposures = exposure(state, slice(None))
     if exposures is None or state.settings.light.exposure != "auto":
         return

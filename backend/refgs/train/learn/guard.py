@@ -44,11 +44,11 @@ class Guard:
     def look(self, state: State, whole: bool, complete: Callable[[], list[int]]) -> str:
         """Look for numbers that are not finite: warn of skipped steps, and remove surfels that have such numbers.
 
-        Numbers are only checked if steps were skipped since the last call, or if `whole` is true. `complete` lists the iterations that have
-        a complete checkpoint.
+        Nothing is checked unless steps were skipped since the last call, or `whole` is true. `complete` lists the iterations that have a
+        complete checkpoint.
 
-        If light or exposures are not finite, or too many steps in a row were skipped, the training must go back to its last checkpoint: the
-        reason is returned. Otherwise "" is returned. Raises InputError if there is no checkpoint, or if this happens again afterwards.
+        The training must go back to its last checkpoint if light or exposures are not finite, or if too many steps in a row were skipped.
+        Then the reason is returned, otherwise "". Raises InputError if there is no checkpoint, or if going back before did not help.
         """
         total, in_a_row, taken = (int(count) for count in self._counts.tolist())
         worse, self._seen = total > self._seen, total

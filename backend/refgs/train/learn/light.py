@@ -23,14 +23,14 @@ MIRROR_VIEWS = 24  # views that tell which part of the light the object mirrors
 
 
 class MirroredLight(Part):
-    """Keep the texels' weights (6·R²,) for `mean_radiance`: `weight` is larger for a texel that more pixels mirror, and sums to 1."""
+    """Keep the texels' weights for `mean_radiance`: `weight` (6·R²,) is larger where more pixels mirror the texel. The weights sum to 1."""
 
     name, saved = "light", ("weight",)
     weight: Tensor | None = None
 
 
 def start_value(state: State) -> float:
-    """Return the raw value at which all texels of the light start. Its activation is the setting `environment.radiance`."""
+    """Return the value at which the light's texels start, before activation. After activation, it is the setting `environment.radiance`."""
     return state.method.light.raw(state.settings.environment.radiance)
 
 

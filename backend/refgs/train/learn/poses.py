@@ -3,8 +3,8 @@
 Each view has a pose (see `render.align`), which moves the scene in front of its camera. Whenever a view is trained on, its pose takes a
 Gauss-Newton step towards the photo. The first steps use reduced pictures, so that a camera that is off by some pixels still converges.
 
-Features that photos have in common tell whether poses need refinement, and whether they have become better. The error against the photos
-cannot tell: it also falls if poses move to fit reflections, which the scene does not explain yet, and which move over the surface.
+Features matched between photos show whether poses need refinement, and whether refined poses are better. The error against the photos does
+not show this: it also falls if poses move to fit reflections, which the scene does not explain yet.
 """
 
 from collections.abc import Mapping
@@ -100,9 +100,9 @@ def remove_common(state: State, step: Step) -> None:
 
 
 def judge(state: State, step: Step) -> None:
-    """Compare the refined cameras with the given ones, once. Keep the refined ones only if matched features fit them far better.
+    """Compare the refined cameras with the given ones, once, if the setting `cameras.poses` is "auto".
 
-    The features are matched between photos. This is done only if the setting `cameras.poses` is "auto".
+    The refined cameras are kept only if features that are matched between photos fit them far better.
     """
     poses = state.part(Poses)
     if poses.values is None or state.settings.cameras.poses != "auto" or poses.judged:

@@ -42,9 +42,9 @@ Maps = dict[int, tuple[Tensor, Camera]]
 class Priors(Part):
     """Hold the normal and depth priors of the training views, which other programs estimated from the photos.
 
-    `normals` and `depth` are dicts: a view's index gives its map, and the photo's camera in the map's size. Maps of normals are int8
-    (H, W, 3): unit vectors in the camera's axes, times CODE. Maps of depth are float32 (H, W) with unknown scale and shift. If `disparity`
-    is true, they all hold disparities. A value of 0 means unknown.
+    `normals` and `depth` are dicts by the view's index. Each entry is a map, and the photo's camera in the size of this map. Maps of
+    normals are int8 (H, W, 3): unit vectors in the camera's axes, times CODE. Maps of depth are float32 (H, W) with unknown scale and
+    shift. If `disparity` is true, all maps of depth hold disparities. A value of 0 means unknown.
     """
 
     name = "priors"
@@ -227,7 +227,7 @@ def _with_axes(state: State, normals: Maps) -> Maps:
 def _near_outline(photo: Photo) -> Tensor:
     """Tell which pixels (H, W) lie just inside the outline of a photo's mask.
 
-    There the visual hull has the surface's normals. Farther inside it may not: over a bowl, the hull has a lid.
+    There the visual hull has the surface's normals. Farther inside, its normals may differ: over a bowl, the hull has a lid.
     """
     if photo.mask is None:
         return torch.zeros(photo.image.shape[:2], dtype=torch.bool, device=photo.image.device)
@@ -238,9 +238,9 @@ def _near_outline(photo: Photo) -> Tensor:
 
 
 def _with_kind(state: State, depth: Maps) -> tuple[Maps, bool]:
-    """Return the maps of depth, and whether they hold disparities. Return no maps if they do not correlate with the first surfels' depth.
+    """Return the maps of depth, and whether they hold disparities. These fall where depth rises: their correlation with depth is negative.
 
-    Disparity falls where depth rises, so its correlation with depth is negative.
+    Returns no maps if these hardly correlate with the depth of the initial surfels.
     """
     if not depth:
         return {}, False

@@ -43,7 +43,7 @@ class TracedMesh(Part):
 
 @torch.no_grad()
 def make_mesh(state: State, step: Step) -> None:
-    """Make the mesh `state.occluder` of the surfels. Set `step.hidden` to the fraction of the object's pixels that mirror the object."""
+    """Make the mesh `state.occluder` from the surfels. Set `step.hidden` to the fraction of the object's pixels that mirror the object."""
     if why_not_traced(state):
         return
     with state.clock.part("visibility"):

@@ -98,7 +98,7 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Shining:
 
 @torch.no_grad()
 def falls_as_metal(observations: Observations, positions: Tensor, light: float) -> Tensor:
-    """Find the surfels of any colour whose radiance falls so far below its median in some photos that they must be metal: a mask (N,).
+    """Find surfels of any colour that must be metal, because their radiance in some photos is far below its median: a mask (N,).
 
     A dielectric has the same diffuse radiance in all photos, and mirrors only a twenty-fifth of the light. Highlights may make it far
     brighter, but without them it is hardly darker than its median. A metal is as dark as what it mirrors. `light` is the light's mean

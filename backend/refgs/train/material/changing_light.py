@@ -66,7 +66,7 @@ class Explained(NamedTuple):
 
 @torch.no_grad()
 def explained(observations: Observations, positions: Tensor, radius: float, *parts: Tensor) -> list[Explained]:
-    """Measure for some parts of a surface how well its changes from photo to photo are explained by a changing light, and by mirroring.
+    """Measure how well two models explain a surface's changes from photo to photo: a changing light, and mirroring.
 
     Each of `parts` (N,) is a mask of surfels, and gets one result. Changes and normals are averaged over neighbours. `radius` is the
     scene's radius in world units.

@@ -1,9 +1,9 @@
 """Learn the relief of coloured metal as normals, not as differences of base colour and roughness.
 
 Base colour and roughness that differ from surfel to surfel explain the shading of an embossed metal as well as normals do, and they learn
-faster. So both are averaged over neighbours of coloured metal until late in the training, and normals must explain finer detail. After
-that, the photos add what normals do not explain, such as dirt in the hollows. Grey metals are left alone, because they may have real
-patterns, coloured or grey: print, brushing and tarnish.
+faster. So until late in the training, both are averaged over neighbouring surfels of coloured metal. Normals must then explain finer
+detail. Later, the photos add what normals do not explain, such as dirt in the hollows. Grey metals are left alone, because they may have
+real patterns, coloured or grey: print, brushing and tarnish.
 """
 
 import torch

@@ -1,10 +1,10 @@
-"""Set a first metallic for surfels by how their colour changes with the viewing direction.
+"""Set a first metallic value for each surfel by how its colour changes with the viewing direction.
 
 Paint explains photos of a rough or embossed metal about as well as metal does. Training starts near paint, so it would stay there. A metal
 tints what it mirrors. So the tint of a surfel's changes tells metal from paint before normals and light are known.
 
-If nearly all of the surface changes as coloured metals do, metallic is held: it no longer learns. Otherwise, training would turn parts of
-the surface back into paint, which explains the photos about as well.
+If nearly all of the surface changes as coloured metals do, metallic values are held: they no longer learn. Otherwise, training would turn
+parts of the surface back into paint, which explains the photos about as well.
 """
 
 import torch
@@ -29,7 +29,7 @@ HELD = Kinds(metal=0.98, paint=0.002)  # metallic that does not learn, in the or
 
 
 class Metals(Part):
-    """Remember in `found` whether photos, or hints by the user, have already told which surfels are metal."""
+    """Remember in `found` whether metals have already been found, from the photos or from the user's hints."""
 
     name, saved = "metals", ("found",)
     found = False
@@ -42,23 +42,23 @@ class Metals(Part):
 
 
 def find_metals(state: State, step: Step) -> None:
-    """Raise the metallic of surfels whose colour changes with the view as only that of metals does. Done once, early in the training.
+    """Raise the metallic value of surfels whose colour changes with the view as only a metal's does. Done once, early in the training.
 
     `shines_as_metal` finds coloured metals, and `falls_as_metal` finds metals of any colour. Two findings rule metal out, and lower the
-    metallic that was learned so far:
+    metallic values that were learned so far:
 
     - The changes fit a light that differs between photos far better than they fit mirroring (see `changing_light.explained`). Then
       nothing is metal.
     - The changes of coloured surfels fit neither a changing light nor mirroring. Then nothing coloured is metal. Fur is an example: from
       some views, it hides what is below it, which has the same colour.
 
-    If nearly all surfels change as coloured metals do, all are metal from then on (see `hold`). Faint changes are enough for this if they
-    fit mirroring. Otherwise, surfels that are not found keep their metallic, which started low, as that of a dielectric.
+    If nearly all of the surface changes as coloured metals do, all surfels are metal from then on (see `hold`). Faint changes also count
+    for this if they fit mirroring. Otherwise, surfels that are not found to be metal keep their metallic value.
 
     If most of the coloured surface changes as metals do, dark parts may be metal, too, such as patina. So dark metals are no longer
     penalised (`loss.dark` is 0 from then on).
 
-    Schedules that propagate normals do not call this function. Propagation finds the metals there, as in the paper.
+    Trainings that propagate normals do not call this function. Propagation finds their metals, as in the Ref-Gaussian paper.
     """
     if state.part(Metals).found:
         return
@@ -99,7 +99,7 @@ def judge(state: State, step: Step) -> None:
     example is the lower half of a ball on a table: it mirrors only the table, so it has learned the table's colour as its own.
 
     A metal becomes paint if it looks the same from everywhere, although a metal would mirror different things. Training can still change
-    the metallic that is set here.
+    the metallic values that are set here.
     """
     if not state.part(Metals).found:
         return
@@ -123,11 +123,11 @@ def judge(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
-    """Measure each surfel's doubt: how little the photos tell metal from paint there, 0..1 (see `same_material.doubt`).
+    """Measure each surfel's doubt: 0 where photos clearly show metal or paint, 1 where they do not show which (see `same_material.doubt`).
 
-    Returns the doubt (N,), and facts for metrics.json: `part` is the fraction of the surface whose doubt is at least DOUBTFUL. If it is
-    more than TOLD, it is announced, and `what` is the text. Surfels whose metallic is held (see `hold`) have doubt 0. Returns None if
-    photos do not decide what is metal: without a light, without specular shading, or without a mask of each photo.
+    Returns the doubt (N,), and facts for metrics.json: `part` is the fraction of the surface whose doubt is at least DOUBTFUL. If this
+    fraction is more than TOLD, it is announced to the user, and `what` is the text. Surfels whose metallic value is held (see `hold`) have
+    doubt 0. Returns None if photos do not decide what is metal, for example without specular shading, or if a photo has no mask.
     """
     if not state.from_hull or not metals_decidable(state, state.iteration):
         return None
@@ -146,7 +146,7 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
 
 @torch.no_grad()
 def hold_as(state: State, kinds: torch.Tensor) -> None:
-    """Set and hold the metallic of surfels by their `kinds` (N,): 0 for metal, 1 for paint, −1 for surfels whose metallic still learns."""
+    """Set and hold the metallic value of surfels by their `kinds` (N,): 0 for metal, 1 for paint, −1 for surfels that still learn it."""
     for number in range(len(HELD)):
         state.learned["metallic"][kinds == number] = raw_metallic(HELD[number])
     state.learned["held"].copy_(kinds >= 0)
@@ -155,7 +155,7 @@ def hold_as(state: State, kinds: torch.Tensor) -> None:
 
 
 def hold(state: State) -> None:
-    """Remove the gradient of the metallic where `held` (N,) is true, so that the metallic of these surfels does not change."""
+    """Remove the gradient of the metallic values where `held` (N,) is true, so that these values do not change."""
     metallic = state.learned.get("metallic")
     if metallic is not None and metallic.grad is not None:
         metallic.grad.masked_fill_(state.learned["held"], 0)

@@ -184,9 +184,9 @@ def _residuals(
 def _fitted(factor: Tensor, totals: Tensor, pixels: Tensor, mean: Tensor, light: Tensor | None) -> Tensor:
     """Correct each surfel's `factor` (N, V) in each photo by the residuals. In the model, a photo shows `factor` times `mean` (N, 3).
 
-    `totals` and `pixels` are the residuals and weights from `_residuals`. All factors of a photo contain its exposure. It is corrected by
-    the median over surfels, which highlights hardly move. With `light` (N, V, 9), harmonics of the normals, factors are also corrected by
-    the diffuse light. They are then scaled to a mean of 1.
+    `totals` and `pixels` are the residuals and weights from `_residuals`. A photo's exposure is part of all factors of this photo. This
+    part is corrected by a median over surfels, which highlights hardly move. With `light` (N, V, 9), harmonics of the normals, factors are
+    also corrected by the diffuse light. Finally, all factors are scaled to a mean of 1.
     """
     brightness = mean.mean(dim=1)
     known = (pixels > LEAST_PIXELS) & (brightness > DARK)[:, None]
@@ -207,9 +207,9 @@ def from_grey(colour: Tensor) -> Tensor:
 
 
 def averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Average observations over each surfel's neighbours. `near` (N, K) are the indices of these.
+    """Average observations over each surfel's neighbours, whose indices are `near` (N, K).
 
-    Returns the averages of `mean` (N, 3) and of `change` (N, V, 3; 0 where unknown), and where the latter is known (N, V).
+    Returns the averages of `mean` (N, 3) and of `change` (N, V, 3), and a mask (N, V) of where the change is known. Elsewhere it is 0.
     """
     weight = observations.pixels * (observations.clipped < LEAST_CLIPPED) * (observations.pixels > LEAST_PIXELS)
     pixels = pooled(weight, near)

@@ -41,7 +41,8 @@ CG_TOLERANCE, CG_STEPS = 1e-3, 200  # tolerance and most steps of conjugate grad
 class Found(NamedTuple):
     """Hold the decision for N surfels.
 
-    - `metal`, `paint` (N,): bool, the surfels taken for paint that are metals, and the surfels taken for metals that are paint
+    - `metal` (N,): bool, the surfels that were taken for paint, but are metal
+    - `paint` (N,): bool, the surfels that were taken for metal, but are paint
     - `like_metals` (N, 4): base colour and roughness of the metals to which each surfel is connected
     """
 
@@ -75,13 +76,13 @@ def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
 
 
 def doubt(surfels: Surfels, seen: Seen, fit: Fit) -> Tensor:
-    """Measure how little photos tell metal from paint, for each surfel: (N,) in 0..1. The metallic learned so far has no influence.
+    """Measure how hard it is to distinguish metal from paint in the photos: (N,), 0..1. Metallic values learned so far do not count.
 
     Doubt is 0 where photos show the kind clearly. It is 1 where hardly any pixel shows the surfel, or where photos show nothing about the
     smooth piece of surface around it. Elsewhere it rises with the distance from surfels of the same piece whose kind photos show.
 
     Let p be the probability of metal. Doubt is 1 − |2 p − 1|. The value 2 p − 1 spreads as in `decide`, from evidence for metal (1) and for
-    paint (−1). The weight OPEN draws all surfels to 0. (In `decide`, surfels are drawn to the kind that the training has found so far.)
+    paint (−1). Far from all evidence, it tends to 0, because all surfels are drawn to 0 with the small weight OPEN.
     """
     graph, _, metal, paint = _evidence(surfels, seen, fit)
     return 1 - torch.from_numpy(_solve(graph, metal + paint + OPEN, metal - paint)).float().abs().clamp_max(1)
@@ -90,7 +91,7 @@ def doubt(surfels: Surfels, seen: Seen, fit: Fit) -> Tensor:
 def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray, np.ndarray]:
     """Return the Laplacian (N, N) of neighbouring surfels, which surfels can be judged (N,), and evidence for metal and for paint (N,).
 
-    A surfel can be judged (1, else 0) if photos show it in more than FRINGE pixels. Evidence is between 0, none, and SURE, the strongest.
+    A surfel can be judged (1, else 0) if photos show it in more than FRINGE pixels. Evidence lies between 0 (none) and SURE (most).
     """
     graph, part = _laplacian(surfels.positions, seen), (seen.pixels > FRINGE).double().numpy()
     ratio = np.asarray((fit.ratio.clamp(1e-3, 1e3).log().double() * fit.seen).numpy())
@@ -106,7 +107,7 @@ def _solve(graph: sparse.csr_matrix, weight: np.ndarray, weighted: np.ndarray) -
     its given value v_i. The second sum makes neighbours alike.
 
     The first sum grows with N. The second sum does not: it approximates the integral of the squared gradient over the surface. So `reach`
-    is proportional to N, but at least LEAST_REACH. It keeps the distance over which evidence spreads independent of N.
+    is proportional to N, but at least LEAST_REACH. Then evidence spreads equally far whatever N is.
     """
     reach = max(REACH * len(weight), LEAST_REACH)
     return cg(reach * graph + sparse.diags(weight), weighted, rtol=CG_TOLERANCE, maxiter=CG_STEPS)[0]
