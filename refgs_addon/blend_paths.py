@@ -16,10 +16,7 @@ from .scene.strokes import STROKES
 
 
 def _change(change: Callable[[str], str]) -> None:
-    """Apply `change` to each path that the add-on stores in the open file.
-
-    Data linked from another .blend is left out, because it is not saved in this one.
-    """
+    """Apply `change` to each path that the add-on stores in the open file."""
     for item, key in _custom_properties():
         item[key] = change(item[key])
     for settings, key in _settings():
@@ -80,10 +77,7 @@ def _after_loading(*_) -> None:
 
 @bpy.app.handlers.persistent
 def _after_appending(context, *_) -> None:
-    """Make paths absolute in data that was appended from another .blend. In that file, they were relative to it.
-
-    Paths that were in this .blend before are absolute already, and stay as they are.
-    """
+    """Make paths absolute in data that was appended from another .blend."""
     libraries = [item.source_library for item in context.import_items if item.source_library is not None]
     if libraries:
         start = os.path.dirname(bpy.path.abspath(libraries[0].filepath))

@@ -15,7 +15,7 @@ BLEND_RELATIVE = {"ANIMATABLE", "PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.versi
 
 
 def set_format(settings: bpy.types.ImageFormatSettings, kind: str, depth: str) -> None:
-    """Set the file format of saved RGBA pictures. `kind` is "PNG" or "OPEN_EXR"; `depth` is the number of bits per channel."""
+    """Set the format of saved RGBA pictures: "PNG" or "OPEN_EXR", with `depth` bits per channel."""
     for name, value in zip(FORMAT, ["IMAGE"] * (len(FORMAT) - 3) + [kind, "RGBA", depth], strict=True):
         setattr(settings, name, value)
 
@@ -43,7 +43,7 @@ def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
 
 
 def node_tree(data: bpy.types.Material | bpy.types.World) -> bpy.types.NodeTree:
-    """Remove all nodes from the node tree of a material or a world, and return the empty tree."""
+    """Empty the node tree of a material or a world, and return it."""
     if data.node_tree is None:  # from 5.0 a tree always exists, and `use_nodes` is deprecated
         data.use_nodes = True
     data.node_tree.nodes.clear()
@@ -51,10 +51,7 @@ def node_tree(data: bpy.types.Material | bpy.types.World) -> bpy.types.NodeTree:
 
 
 def modifier_input(modifier: bpy.types.NodesModifier, name: str) -> tuple[bpy.types.bpy_struct, str]:
-    """Find where Blender stores an input of a geometry-nodes modifier.
-
-    Returns the data that holds the input, and the name of the property in it: the two arguments for `layout.prop`.
-    """
+    """Return the data and property name that `layout.prop` needs to draw a modifier's input."""
     identifier = modifier.node_group.interface.items_tree[name].identifier
     if hasattr(modifier, "properties"):  # from 5.2
         return getattr(modifier.properties.inputs, identifier), "value"
@@ -79,7 +76,7 @@ def set_modifier_input(modifier: bpy.types.NodesModifier, name: str, value) -> N
 
 
 def get_modifier_input(modifier: bpy.types.NodesModifier, name: str):
-    """Return the value of a modifier's input. For a menu, this is the name of the chosen item. For an empty object input, it is None."""
+    """Return the value of a modifier's input; for a menu, the chosen item's name."""
     owner, path = modifier_input(modifier, name)
     if path == "value":
         return owner.value

@@ -9,5 +9,5 @@ class InputError(Exception):
 
 
 def missing_module(error: ModuleNotFoundError) -> str:
-    """Return a message for the artist that Blender's Python lacks a package. Debian's Blender may lack numpy."""
+    """Return a message for the artist that Blender's Python lacks a package."""
     return f"Blender's Python lacks {error.name}: install it (on Debian, python3-{error.name})"

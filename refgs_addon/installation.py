@@ -38,21 +38,18 @@ NEEDED, NEEDED_WITH_CARD = 2 * GB, 7 * GB  # torch's CUDA builds include CUDA's 
 
 
 def wheel(name: str) -> Path | None:
-    """Find the wheel (Python package file) of `name` that comes with the add-on.
-
-    Returns None if there is none. An add-on that runs from the repository has no wheels.
-    """
+    """Return the add-on's bundled wheel of the package `name`, or None if there is none."""
     return next(WHEELS.glob(f"{name}-*.whl"), None)
 
 
 def bundled_version() -> str:
-    """Return the version of the trainer that comes with the add-on, or "" if none does."""
+    """Return the version of the trainer that comes with the add-on, or "" if none."""
     file = wheel("refgs") if wheel("uv") else None
     return file.name.split("-")[1] if file else ""
 
 
 def installed(home: Path) -> str:
-    """Return the version of the trainer that is installed in the folder `home`, or "" if none is."""
+    """Return the version of the trainer installed in the folder `home`, or "" if none."""
     try:
         return _marker(home).read_text(encoding="utf-8")
     except OSError:
@@ -60,10 +57,7 @@ def installed(home: Path) -> str:
 
 
 def origin(home: Path) -> str:
-    """Read the installation's sentence about its packages: which hosts they came from, or that their hashes were not checked.
-
-    Returns "" if there is no such sentence.
-    """
+    """Return the sentence on where the installed packages came from, or "" if none."""
     try:
         return (home / "origin").read_text(encoding="utf-8")
     except OSError:
@@ -76,7 +70,7 @@ def interrupted(home: Path) -> bool:
 
 
 def python(home: Path) -> Path:
-    """Return the path of Python in the trainer's environment. `home` is the folder where the trainer is installed."""
+    """Return the path of Python in the environment of the trainer installed in `home`."""
     return home / "env" / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
 
 
@@ -93,17 +87,17 @@ def needed_bytes() -> float:
 
 
 def free_bytes(home: Path) -> float:
-    """Return the free bytes on the disk for the folder `home`. The folder may not exist yet."""
+    """Return the free bytes on the disk of a folder that may not exist yet."""
     return shutil.disk_usage(next(folder for folder in (home, *home.parents) if folder.is_dir())).free
 
 
 def space_line(home: Path) -> str:
-    """Describe the needed and the free disk space, such as "it needs about 2 GB; 80 GB are free"."""
+    """Describe the needed and the free disk space as part of a sentence."""
     return f"it needs about {needed_bytes() / GB:.0f} GB; {free_bytes(home) / GB:.0f} GB are free"
 
 
 def disk_full_line(home: Path) -> str:
-    """Return an error message if the disk has too little space to complete the installation, else ""."""
+    """Return an error message if the disk lacks space to complete the installation, else ""."""
     if installed(home) or free_bytes(home) + folder_bytes(home) >= needed_bytes():
         return ""
     return f"too little space on the disk of {home} ({space_line(home)}): free some, or choose a Python that has the trainer"
@@ -131,7 +125,7 @@ _child: subprocess.Popen | None = None
 
 
 class _Failed(Exception):
-    """End the command with an error. The exception's text is the one line that the artist sees."""
+    """End the command with an error, whose text is shown to the artist."""
 
 
 def main() -> None:
@@ -164,7 +158,7 @@ def _emit(event: str, **facts) -> None:
 
 
 def exit_with_stdin() -> None:
-    """Wait for the end of stdin, then kill the child process and exit. Runs in a thread of its own."""
+    """Wait for the end of stdin, then kill the child process and exit."""
     sys.stdin.read()
     with _starting:  # no child is started after this
         if _child is not None:
@@ -174,10 +168,7 @@ def exit_with_stdin() -> None:
 
 @contextlib.contextmanager
 def _locked(home: Path) -> Iterator[None]:
-    """Hold a lock that keeps other processes from installing or removing the trainer. Raises _Failed if another process holds it.
-
-    The system frees the lock when this process ends, even by a crash.
-    """
+    """Lock the installation against other processes, or raise _Failed if one has locked it."""
     home.parent.mkdir(parents=True, exist_ok=True)
     with open(home.with_name(f"{home.name}.lock"), "ab") as file:
         try:
@@ -225,13 +216,7 @@ def _install(home: Path, uv: Path, trainer: Path) -> None:
 
 
 def _choose_lock(program: Path, variables: dict[str, str], home: Path, locks: Path) -> Path:
-    """Choose the lock file (versions and hashes of all packages) for this machine. Returns its path in the folder `locks`.
-
-    uv chooses a build of torch for the machine. The end of torch's version names it: 2.14.0+cpu is the build cpu. If there is a lock file
-    for that build, such as lock-cpu.txt, return it. UV_TORCH_BACKEND in `variables` then becomes the build's name.
-
-    Otherwise return lock.txt, for which torch comes from the package index. UV_TORCH_BACKEND is then deleted from `variables`.
-    """
+    """Choose this machine's lock file in `locks`, and change UV_TORCH_BACKEND in `variables` to match."""
     lock, wanted = locks / "lock.txt", home / "torch.txt"
     if "UV_TORCH_BACKEND" not in variables or not (pinned := re.search(r"^torch==\S+", lock.read_text(), re.M)):
         return lock
@@ -253,20 +238,14 @@ def _choose_lock(program: Path, variables: dict[str, str], home: Path, locks: Pa
 
 
 def _resolve(program: Path, variables: dict[str, str], home: Path, requirements: Path) -> dict[str, tuple[str, str]]:
-    """Ask uv which version of each package it takes for this machine, and from which package index.
-
-    `requirements` is a file that names the packages. Returns (version, index) by package.
-    """
+    """Ask uv for the (version, package index) of each package that the file `requirements` names."""
     how = ["--no-deps", "--no-header", "--no-annotate", "--emit-index-annotation", "--python", str(python(home))]
     said = _run_uv(program, variables, home, "pip", "compile", *how, str(requirements))
     return {name: (version, index) for name, version, index in re.findall(r"(?m)^(\S+)==(\S+)\n +# from (.+)$", said)}
 
 
 def _describe_origin(packages: dict[str, tuple[str, str]]) -> str:
-    """Return a sentence for the artist: how many packages came from which host.
-
-    `packages` has (version, index) by package, as `_resolve` returns it.
-    """
+    """Describe for the artist how many of `_resolve`'s packages came from which host."""
     hosts: dict[str, list[str]] = {}
     for name, (version, index) in packages.items():
         hosts.setdefault(urlsplit(index).hostname or index, []).append(f"{name} {version}")
@@ -283,7 +262,7 @@ def _remove(home: Path) -> None:
 
 
 def _unpack(uv: Path, home: Path) -> Path:
-    """Unpack uv's program from its wheel, and make it executable. Blender installs the wheel without the executable flag."""
+    """Unpack uv's program from its wheel, and make it executable."""
     name = "uv.exe" if sys.platform == "win32" else "uv"
     program = home / name
     with zipfile.ZipFile(uv) as archive:
@@ -295,15 +274,7 @@ def _unpack(uv: Path, home: Path) -> Path:
 
 
 def _uv_environment(home: Path) -> dict[str, str]:
-    """Return the environment variables for uv. Variables that the user has set, such as the address of a package mirror, keep their values.
-
-    uv downloads a Python of its own for the trainer. Blender's Python or the system's would not do, because an update may replace it.
-
-    UV_TORCH_BACKEND is "auto" by default: uv then chooses the build of torch for this machine's GPU. With some package mirrors, torch must
-    come from the package index. The user then sets UV_TORCH_BACKEND to "", and this function removes it.
-
-    Variables whose names begin with PYTHON are removed, too.
-    """
+    """Return the environment variables for uv; those that the user has set keep their values."""
     set_here = {"UV_TORCH_BACKEND": "auto", "UV_PYTHON_INSTALL_DIR": str(home / "python")}
     if not os.environ.keys() & {
         "UV_PYTHON_PREFERENCE",
@@ -325,10 +296,7 @@ def _start(words: list[str], **how) -> subprocess.Popen:
 
 
 def _run_uv(program: Path, variables: dict[str, str], home: Path, *arguments: str) -> str:
-    """Run uv with these command-line arguments, report its progress, and return what it printed.
-
-    Raises _Failed with a message for the artist if uv fails.
-    """
+    """Run uv, report its progress and return its output, or raise _Failed if it fails."""
     options = ["--color", "never", "--cache-dir", str(home / "cache")]
     process = _start([str(program), *options, *arguments], stderr=subprocess.STDOUT, env=variables, cwd=home)
     fetching: dict[str, str] = {}  # size by package
@@ -356,11 +324,7 @@ def _run_uv(program: Path, variables: dict[str, str], home: Path, *arguments: st
 
 
 def _report_download(home: Path, fetching: dict[str, str], ended: threading.Event) -> None:
-    """Report the progress of uv's downloads every two seconds, until the event `ended` is set. Runs in a thread of its own.
-
-    uv prints nothing while it downloads torch, which takes minutes. So the progress is the size of uv's cache folder. `fetching` maps each
-    package that uv downloads now to its size, as uv prints it.
-    """
+    """Report the progress of the downloads in `fetching` every two seconds until `ended` is set."""
     while not ended.wait(2):
         now = list(fetching.items())
         if now:
@@ -376,7 +340,7 @@ def _report_download(home: Path, fetching: dict[str, str], ended: threading.Even
 
 
 def _start_trainer(python: Path) -> None:
-    """Start the installed trainer once to test it, and print the event with its version and GPU. Raises _Failed if it does not start."""
+    """Start the trainer once to print its version and GPU, or raise _Failed."""
     process = _start([str(python), "-E", "-P", "-m", "refgs.cli", "worker"])
     heard = process.communicate()[0].splitlines()
     event = json.loads(heard[0]) if process.returncode == 0 and heard else {}
@@ -386,10 +350,7 @@ def _start_trainer(python: Path) -> None:
 
 
 def explain_uv_error(text: str, home: str) -> str:
-    """Turn what uv printed into one error message for the artist. Returns "" if the error is not a known one.
-
-    `home` is the installation folder, which the message names.
-    """
+    """Turn uv's output into an error message for the artist, or "" if unknown."""
     lower = text.lower()
     if wrong := re.search(r"Hash mismatch for `([^`]+)`", text):
         what = f"{wrong[1]}: the file that was fetched is not the one that was released (its SHA-256 is another)"

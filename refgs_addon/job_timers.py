@@ -19,7 +19,7 @@ _batch = Path()  # folder of the batch whose table is shown
 
 
 def follow_jobs() -> None:
-    """Start a timer that polls the jobs until all have ended. Does nothing if the timer runs already."""
+    """Ensure that a timer polls the jobs until all have ended."""
     if not bpy.app.timers.is_registered(_poll_jobs):
         bpy.app.timers.register(_poll_jobs, first_interval=POLL_SECONDS, persistent=True)
 

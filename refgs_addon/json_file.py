@@ -8,7 +8,7 @@ from .ordinary import read_text
 
 
 def read_json(path: Path) -> dict | list:
-    """Read a JSON file that holds a dictionary or a list. Raises InputError if it is missing, broken or holds something else."""
+    """Read a dictionary or list from a JSON file. Raises InputError where there is none."""
     try:
         found = json.loads(read_text(path))
     except OSError as error:

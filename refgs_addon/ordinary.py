@@ -14,10 +14,7 @@ LARGEST = 64 << 20  # bytes of a text file
 
 
 def check_file(path: Path) -> None:
-    """Raise OSError unless a path leads to a regular file that is not empty.
-
-    Linux's /proc has regular files whose size is 0, but which may have no end.
-    """
+    """Raise OSError unless a path leads to a regular file that is not empty."""
     facts = os.stat(path)
     if not stat.S_ISREG(facts.st_mode):
         raise OSError(errno.EINVAL, "this is not a file", str(path))
@@ -26,7 +23,7 @@ def check_file(path: Path) -> None:
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a regular file to read its bytes. Raises OSError if it cannot be read, is not a regular file, or is empty."""
+    """Open a regular file to read its bytes. Raises OSError also if it is empty."""
     check_file(path)
     return open(path, "rb")
 

@@ -51,7 +51,7 @@ def read_rows(path: Path) -> np.ndarray:
 
 
 def read_header(path: Path) -> tuple[list[list[str]], int]:
-    """Read the header of a PLY file: the words of each line, and the number of bytes before the first row. Raises InputError."""
+    """Read a PLY header: each line's words, and the header's size in bytes. Raises InputError."""
     try:
         with open_file(path) as file:
             head = file.read(LONGEST_HEADER)
@@ -66,10 +66,7 @@ def read_header(path: Path) -> tuple[list[list[str]], int]:
 
 
 def _parse(lines: list[list[str]], path: Path) -> tuple[str, list[Element]]:
-    """Parse the lines of a header, which `read_header` returns. Raises InputError if they are wrong.
-
-    Returns the byte order of the rows, "<" or ">", or "" for a text file. Also returns the elements.
-    """
+    """Parse a header's lines into the byte order ("" for text) and elements. Raises InputError."""
     if (
         lines[0] != ["ply"]
         or len(lines) < 2
@@ -105,11 +102,7 @@ def _parse(lines: list[list[str]], path: Path) -> tuple[str, list[Element]]:
 
 
 def _check_size(file: BinaryIO, order: str, elements: list[Element], path: Path) -> None:
-    """Raise InputError if a file is truncated, or has more rows than its header says. Call this before memory is reserved for the rows.
-
-    `order` is the byte order, "" for text. The header does not say how long lists are. So this check treats all lists as empty, and does
-    not look for surplus rows in a binary file with lists.
-    """
+    """Raise InputError if a file is truncated, or has more rows than its header says."""
     start = file.tell()
     there, need, last = os.fstat(file.fileno()).st_size - start, 0, 0
     for _, count, properties in elements:
@@ -180,10 +173,7 @@ def _length(value: float) -> int:
 
 
 def _number(kind: str, word: bytes | str) -> float | int:
-    """Parse a number of the PLY type `kind`.
-
-    Raises ValueError if `word` is no such number, or if it is empty, which means that the line has too few numbers.
-    """
+    """Parse a number of the PLY type `kind`, or raise ValueError if it is invalid."""
     types = np.dtype(PLY_TYPES[kind])
     if not word:
         raise ValueError("early end of line")

@@ -68,13 +68,13 @@ def preferences() -> Preferences:
 
 
 def set_up() -> bool:
-    """Return True if the trainer is installed, or if the artist has chosen a Python that should have it."""
+    """Check whether the trainer is installed, or the artist has chosen a Python for it."""
     addon = bpy.context.preferences.addons.get(PACKAGE)
     return addon is not None and bool(addon.preferences.python or installation.installed(home()))
 
 
 def python() -> Path:
-    """Return the path of the Python that has the trainer. Raises InputError where there is none."""
+    """Return the path of the trainer's Python. Raises InputError where there is none."""
     if preferences().python:
         return Path(bpy.path.abspath(preferences().python))
     if not set_up():
@@ -94,7 +94,7 @@ def hdri_folder() -> Path | None:
 
 
 def mask_model() -> Path | None:
-    """Return the path of the artist's own ONNX model that finds the object in a photo, for masks. Return None if none is chosen."""
+    """Return the path of the artist's own ONNX model for masks, or None."""
     return Path(bpy.path.abspath(preferences().mask_model)) if preferences().mask_model else None
 
 
@@ -117,10 +117,7 @@ def hints_file(run: Path) -> Path:
 
 
 def _folder(name: str) -> Path:
-    """Return the path of the folder `name` for the add-on's own data. Updates of the add-on keep this folder.
-
-    If the add-on is not installed as a Blender extension, the folder is temporary.
-    """
+    """Return the path of the folder `name` for data that updates of the add-on keep."""
     try:
         return Path(bpy.utils.extension_path_user(PACKAGE, path=name))
     except ValueError:
@@ -128,7 +125,7 @@ def _folder(name: str) -> Path:
 
 
 def query_trainer() -> None:
-    """Start a job that asks the trainer for its version and GPU. `status` then shows the answer. Does nothing if no trainer is set up."""
+    """Start a job that asks the trainer for the version and GPU that `status` shows."""
     forget_queries()
     if set_up():
         _own_jobs.append(jobs.query_trainer(python(), log_file("trainer")))
@@ -161,7 +158,7 @@ def stop() -> None:
 
 
 def forget_queries() -> None:
-    """Stop and forget the job that the preferences started, if any: a query of the trainer's version, an installation or a removal."""
+    """Stop and forget the job that the preferences started, if any."""
     for job in _own_jobs:
         job.stop()
         if job in jobs.JOBS:
@@ -180,7 +177,7 @@ def installing() -> jobs.Job | None:
 
 
 def status() -> tuple[str, str]:
-    """Return the name of an icon, and one line for the artist, that describe the trainer's status."""
+    """Describe the trainer's status by an icon's name and a line for the artist."""
     job = _own_jobs[0] if _own_jobs else None
     if job and job.state == "failed":
         return "ERROR", job.line[0].upper() + job.line[1:]
@@ -196,7 +193,7 @@ def status() -> tuple[str, str]:
 
 
 def installation_problem() -> str:
-    """Return why the trainer cannot be installed now, as a line for the artist, or "" if it can."""
+    """Return why the trainer cannot be installed now, or "" if it can."""
     if not installation.bundled_version():
         return "This copy of the add-on contains no trainer: choose a Python that has it"
     if preferences().python:

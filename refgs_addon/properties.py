@@ -17,7 +17,7 @@ from .scene.run_parts import ROOT
 
 
 class KnownRun(bpy.types.PropertyGroup):
-    """Store one entry in the scene's list of runs: the folder of a training's result, and the capture that was trained."""
+    """Store one run of the scene's list: its folder, capture and confirmed decisions."""
 
     folder: StringProperty(subtype="DIR_PATH", options=BLEND_RELATIVE)
     capture: StringProperty(subtype="DIR_PATH", options=BLEND_RELATIVE)
@@ -50,10 +50,7 @@ class Many(bpy.types.PropertyGroup):
 
 
 class BatchRow(bpy.types.PropertyGroup):
-    """Hold a row of the table of a batch (the training of many captures), with the fields of `scene.batch_table.Row`.
-
-    Rows are not saved in the .blend file.
-    """
+    """Hold a row of the table of a batch, with the fields of `scene.batch_table.Row`."""
 
     name: StringProperty()
     state: StringProperty()
@@ -181,5 +178,5 @@ def _longest_side(item: bpy.types.Object) -> float:
 
 
 def _scale_to(item: bpy.types.Object, metres: float) -> None:
-    """Scale the Empty of an imported run uniformly, so that the run's longest side becomes `metres` long."""
+    """Scale a run's Empty uniformly until the run's longest side is `metres` long."""
     item.scale *= metres / max(_longest_side(item), 1e-12)

@@ -34,7 +34,7 @@ def add(tree: bpy.types.NodeTree, kind: str, inputs: dict | None = None, **prope
 
 
 def add_input(tree: bpy.types.NodeTree, name: str, kind: str, description: str = "", **properties):
-    """Add an input socket of a type ("Float", "Object" …) to a node tree, and return it. `properties` are set on the socket."""
+    """Add and return an input socket of a `kind` such as "Float", with these `properties`."""
     socket = tree.interface.new_socket(name, in_out="INPUT", socket_type=f"NodeSocket{kind}", description=description)
     for key, value in properties.items():
         setattr(socket, key, value)
@@ -52,12 +52,12 @@ def principled(material: bpy.types.Material) -> bpy.types.ShaderNode:
 
 
 def math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSocket:
-    """Add a math node and return its output. Each of `inputs` is a socket or a number."""
+    """Add a math node whose inputs are sockets or numbers, and return its output."""
     return out(add(tree, "ShaderNodeMath", dict(enumerate(inputs)), operation=operation))
 
 
 def vector_math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSocket:
-    """Add a vector math node and return its output. Each of `inputs` is a socket or a vector."""
+    """Add a vector math node whose inputs are sockets or vectors, and return its output."""
     return out(add(tree, "ShaderNodeVectorMath", dict(enumerate(inputs)), operation=operation))
 
 
@@ -67,7 +67,7 @@ def scaled(tree: bpy.types.NodeTree, vector, factor) -> bpy.types.NodeSocket:
 
 
 def read_attribute(tree: bpy.types.NodeTree, name: str, kind: str) -> bpy.types.NodeSocket:
-    """Add a node that reads the geometry's attribute `name`, and return its output. `kind` is its data type, such as "FLOAT"."""
+    """Add a node that reads a geometry attribute of the type `kind`, such as "FLOAT"."""
     return out(add(tree, "GeometryNodeInputNamedAttribute", {"Name": name}, data_type=kind))
 
 
@@ -92,6 +92,6 @@ def object_frame(tree: bpy.types.NodeTree, item: bpy.types.NodeSocket) -> tuple[
 
 
 def max_component(tree: bpy.types.NodeTree, vector: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """Add nodes that compute max(|x|, |y|, |z|) of a vector, and return their output. The result is at most 1 in the cube from -1 to 1."""
+    """Add nodes that compute max(|x|, |y|, |z|) of a vector, and return their output."""
     x, y, z = add(tree, "ShaderNodeSeparateXYZ", {0: vector_math(tree, "ABSOLUTE", vector)}).outputs
     return math(tree, "MAXIMUM", math(tree, "MAXIMUM", x, y), z)

@@ -15,13 +15,13 @@ TOLD, DOUBTFUL = (0.089, 0.1, 0.119, 1.0), (1.0, 0.319, 0.02, 1.0)
 
 
 def doubt_color(tree: bpy.types.NodeTree, doubt: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """Add a node that turns doubt into a colour: grey for 0, orange for 1. Returns its output."""
+    """Add a node that turns doubt into a colour: grey for 0, orange for 1."""
     colors = {"A": from_rec709(TOLD), "B": from_rec709(DOUBTFUL)}
     return out(add(tree, "ShaderNodeMix", {"Factor": doubt, **colors}, data_type="RGBA"))
 
 
 def doubt_material(name: str, texture: bpy.types.Image) -> bpy.types.Material:
-    """Make a material that shows doubt as colours, without lighting. `texture` has a mesh's doubt as grey values 0..1."""
+    """Make a material that shows a texture's doubt, 0..1, as colours without lighting."""
     material = bpy.data.materials.new(name)
     tree = node_tree(material)
     doubt = add(tree, "ShaderNodeTexImage", image=texture).outputs["Color"]
@@ -31,7 +31,7 @@ def doubt_material(name: str, texture: bpy.types.Image) -> bpy.types.Material:
 
 
 def doubt_tree() -> bpy.types.NodeTree:
-    """Make the node tree `RefGS Doubt`, or return the existing one. It replaces a mesh's material by the tree's input Material."""
+    """Make or reuse the node tree whose input Material replaces the material of a mesh."""
     if NAME in bpy.data.node_groups:
         return bpy.data.node_groups[NAME]
     tree = modifier_tree(NAME)

@@ -100,10 +100,7 @@ def edit_tree() -> bpy.types.NodeTree:
 
 
 def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.NodeSocket:
-    """Add the nodes for the mask that `edit_tree` describes, 0..1 for each splat, and return their output.
-
-    `group` holds the inputs of the tree.
-    """
+    """Add the nodes for the mask that `edit_tree` describes, 0..1 for each splat."""
     menu = add(tree, "GeometryNodeMenuSwitch", data_type="FLOAT")
     menu.enum_items.clear()
     for name in REGIONS:
@@ -172,10 +169,7 @@ def mesh_edits_tree() -> bpy.types.NodeTree:
 
 
 def add_edits_to_material(material: bpy.types.Material) -> None:
-    """Add nodes to a mesh's material that blend edited base colour, metallic and roughness over its textures.
-
-    Does nothing if the material has these nodes already.
-    """
+    """Make a mesh's material blend the edited base colour, metallic and roughness over its textures."""
     tree = material.node_tree
     if _MIXED in tree.nodes or not any(node.type == "BSDF_PRINCIPLED" for node in tree.nodes):
         return

@@ -64,7 +64,7 @@ def connect_edits(material: bpy.types.Material) -> None:
 
 
 def values_material() -> bpy.types.Material:
-    """Make the material `RefGS Splat Values`, or return the existing one. It shows the attribute `display` without lighting."""
+    """Make or reuse the material that shows the attribute `display` without lighting."""
     if VALUES_NAME in bpy.data.materials:
         return bpy.data.materials[VALUES_NAME]
     material = bpy.data.materials.new(VALUES_NAME)
@@ -74,13 +74,7 @@ def values_material() -> bpy.types.Material:
 
 
 def _finish(material: bpy.types.Material, shader: bpy.types.NodeSocket) -> None:
-    """Make a splat transparent by its alpha, opacity · exp(-(u² + v²) / 2), and connect its shader to the material's output.
-
-    (u, v) is the position on the splat in standard deviations.
-
-    Eevee renders many samples of a pixel. In each sample, it draws a quad with a probability equal to its alpha, and of all drawn quads the
-    nearest one is visible. The average over the samples equals alpha compositing of the quads, sorted by depth in each pixel.
-    """
+    """Give a splat its Gaussian alpha, and connect its `shader` to the material's output."""
     material.surface_render_method = "DITHERED"
     tree = material.node_tree
     gaussian = _attribute(tree, "gaussian", VECTOR)
@@ -96,12 +90,7 @@ def _attribute(tree: bpy.types.NodeTree, name: str, output: int) -> bpy.types.No
 
 
 def _normal(tree: bpy.types.NodeTree) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
-    """Add nodes for the normal at a position (u, v) on a curved splat, and for the splat's visible side.
-
-    The normal is n + u·dn/du + v·dn/dv, in world space. Returns two outputs: the normal, and 1 on the splat's front, else 0. Near
-    silhouettes the normal can point away from the viewer, and a BSDF would be black. Such a normal is turned until it is perpendicular to
-    the view direction.
-    """
+    """Add nodes for a curved splat's world-space normal and visible side (1 front, 0 back)."""
     u_v = add(tree, "ShaderNodeSeparateXYZ", {"Vector": _attribute(tree, "gaussian", VECTOR)}).outputs
     centre = _attribute(tree, "normal", VECTOR)
     bent = vector_math(tree, "ADD", centre, scaled(tree, _attribute(tree, "normal_u", VECTOR), u_v["X"]))

@@ -81,10 +81,7 @@ def _term(number: int) -> str:
 
 
 def _switch_off_elsewhere(value: bpy.types.NodeSocket) -> None:
-    """Drive a Value node: 1 if Eevee renders the scene, otherwise 0.
-
-    Blender can evaluate the driver without Python, because its expression is only a comparison.
-    """
+    """Drive a Value node: 1 if Eevee renders the scene, otherwise 0."""
     driver = value.driver_add("default_value").driver
     variable = driver.variables.new()
     variable.name, variable.type = "engine", "CONTEXT_PROP"
@@ -108,10 +105,7 @@ def set_harmonics(tree: bpy.types.ShaderNodeTree, harmonics: Sequence[Sequence[f
 
 
 def add_world_diffuse(material: bpy.types.Material, occlusion: bpy.types.NodeSocket | None = None) -> None:
-    """Insert the group `RefGS World Diffuse` before the base colour of a material's Principled BSDF.
-
-    `occlusion` is the socket in the material's tree that has the occlusion, or None.
-    """
+    """Insert the group `RefGS World Diffuse` before the base colour of a material's Principled BSDF."""
     tree, shader = material.node_tree, principled(material)
     node = add(tree, "ShaderNodeGroup", name=NAME, node_tree=world_diffuse_group())
     for name in ("Base Color", "Metallic", "Normal"):

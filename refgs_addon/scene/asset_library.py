@@ -20,12 +20,12 @@ _HEADER = "# This is an Asset Catalog Definition file for Blender.\n\nVERSION 1\
 
 
 def missing_assets(folder: Path) -> list[Row]:
-    """List the finished runs of a batch that have no asset in the batch's library yet. `folder` is the folder of the batch's runs."""
+    """List the finished runs in a batch's folder that have no asset yet."""
     return [row for row in read_rows(folder) if row.state == "done" and not asset_file(folder, row.name).exists()]
 
 
 def asset_file(folder: Path, name: str) -> Path:
-    """Return the path of the .blend file for the asset of the run `name`. `folder` is the folder of the batch's runs."""
+    """Return the path of a run's asset file (.blend) in a batch's folder."""
     return folder / LIBRARY / f"{name}.blend"
 
 
@@ -102,10 +102,7 @@ def add_catalog(library: Path) -> None:
 
 
 def add_library(folder: Path) -> None:
-    """Add a batch's library to the asset libraries in Blender's preferences, unless it is listed there already.
-
-    `folder` is the folder of the batch's runs.
-    """
+    """Add a batch's library to Blender's asset libraries, unless it is listed there already."""
     preferences, path = bpy.context.preferences, (folder / LIBRARY).resolve()
     known = preferences.filepaths.asset_libraries
     if all(Path(bpy.path.abspath(library.path)).resolve() != path for library in known):

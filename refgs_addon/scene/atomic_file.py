@@ -10,7 +10,7 @@ from ..errors import InputError
 
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yield a temporary file beside `path`, and rename it to `path` at the end of the `with` block. Raises InputError if a write fails."""
+    """Yield a temporary file that becomes `path` after the `with` block. Raises InputError."""
     # Keep the extension last: Blender appends a missing one.
     temporary = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
@@ -24,6 +24,6 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def unwritable(path: Path, error: RuntimeError | OSError) -> InputError:
-    """Return an InputError that says why a file cannot be written. Blender's own writers raise RuntimeError, without a reason."""
+    """Return an InputError that says why a file cannot be written."""
     reason = getattr(error, "strerror", None) or "does its folder exist, and has the disk free space?"
     return InputError(f"cannot write {path}: {reason}")

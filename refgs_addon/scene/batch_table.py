@@ -65,9 +65,9 @@ def read_rows(folder: Path) -> list[Row]:
 
 
 def _inside(folder: Path, path: object, endings: tuple[str, ...]) -> str:
-    """Return `path` if it is an existing file in the batch's `folder` with one of the suffixes `endings`. Otherwise return "".
+    """Return `path` if it is a file in `folder` with an allowed suffix, else "".
 
-    The panel opens the file with the system's default program. Without this check, a damaged table could make it run any program.
+    The panel opens it: a damaged table must not make it run any program.
     """
     file = Path(str(path or "")).resolve()
     known = file.is_relative_to(folder.resolve()) and file.suffix.lower() in endings and file.is_file()
@@ -75,7 +75,7 @@ def _inside(folder: Path, path: object, endings: tuple[str, ...]) -> str:
 
 
 def _words(state: str, facts: dict) -> str:
-    """Describe a run's progress or result, such as "training, 42 %" or "31.2 dB, 3.4 min". `facts` is the run's row in the table file."""
+    """Describe a run, such as "training, 42 %" or "31.2 dB, 3.4 min"."""
     if state == "running":
         part = facts["part"]
         step = _STEPS.get(facts["step"], str(facts["step"]))
@@ -88,7 +88,7 @@ def _words(state: str, facts: dict) -> str:
 
 
 def show_table(folder: Path) -> bool:
-    """Copy a batch's table into the panel's list if the table file or the batch's state has changed. Return True if rows were copied."""
+    """Show a batch's table in the panel's list, and return True if it has changed."""
     global _shown
     try:
         changed = (folder / jobs.LOGS / ROWS).stat().st_mtime_ns
@@ -116,13 +116,13 @@ def is_shown(folder: Path) -> bool:
 
 
 def chosen_row(folder: Path) -> bpy.types.PropertyGroup | None:
-    """Return the row that is selected in the panel's list. Return None if the list is empty, or shows another folder's batch."""
+    """Return the row of a batch that is selected in the panel's list, or None."""
     manager = bpy.context.window_manager
     rows = manager.refgs_rows if is_shown(folder) else ()
     return rows[manager.refgs_row] if 0 <= manager.refgs_row < len(rows) else None
 
 
 def forget_table() -> None:
-    """Forget which batch's table is in the panel's list. The add-on calls this when it removes the list."""
+    """Forget which batch's table is in the panel's list."""
     global _shown
     _shown = None

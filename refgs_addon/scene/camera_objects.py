@@ -117,7 +117,7 @@ def show_photo(camera: bpy.types.Object, amount: float = 1.0) -> None:
 
 
 def photo_shown(camera: bpy.types.Object | None) -> float:
-    """Return the opacity of the photo over a camera's view, or 0 where no photo is shown."""
+    """Return the opacity of the photo over a camera's view, 0 where none is shown."""
     layers = camera.data.background_images if camera is not None and camera.type == "CAMERA" else ()
     return layers[0].alpha if layers and camera.data.show_background_images else 0.0
 

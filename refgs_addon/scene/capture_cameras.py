@@ -28,7 +28,7 @@ def show_cameras(scene: bpy.types.Scene, capture: Path, cameras: Path) -> bpy.ty
 
 
 def cameras_of(scene: bpy.types.Scene, capture: Path) -> bpy.types.Collection | None:
-    """Find the collection of cameras that `show_cameras` added for a capture. Returns None if there is none."""
+    """Find the collection of cameras that `show_cameras` added for a capture, or return None."""
     return next((item for item in _captures(scene) if item[CAPTURE] == str(capture)), None)
 
 

@@ -44,7 +44,7 @@ _VIEWS = ("Standard", "Un-tone-mapped")
 
 
 def set_color_space(image: bpy.types.Image, names: tuple[str, ...]) -> bool:
-    """Set an image's colour space to the first of `names` that the OpenColorIO config has. If there is none, return False."""
+    """Give an image the first of these colour spaces that exists, else return False."""
     return _set_first(image.colorspace_settings, "name", names)
 
 
@@ -58,10 +58,7 @@ def from_rec709(colors: "np.ndarray | tuple[float, ...]") -> "np.ndarray | tuple
 
 
 def to_rec709(colors: "np.ndarray | tuple[float, ...]") -> "np.ndarray | tuple[float, ...]":
-    """Convert colours of Blender's working space to linear Rec.709: the inverse of `from_rec709`.
-
-    Colours that Rec.709 cannot show have components below 0 or above 1.
-    """
+    """Convert colours of Blender's working space to linear Rec.709, unclipped."""
     return _convert(colors, _working_space().inverted())
 
 
@@ -81,9 +78,7 @@ def _convert(colors: "np.ndarray | tuple[float, ...]", matrix: Matrix) -> "np.nd
 def _working_space() -> Matrix:
     """Find the matrix from linear Rec.709 to Blender's working space.
 
-    Blender converts the primaries as it converts pictures, so that splats agree with textures. Its functions for single colours know the
-    working space only by the config's interchange roles. Configs of ACES 1.0 to 1.2 have none, and the functions then change nothing.
-    They serve where no name of linear Rec.709 is known.
+    A picture is converted, because the functions for single colours change nothing with configs of ACES 1.0 to 1.2.
     """
     image = bpy.data.images.new("primaries", 3, 1, float_buffer=True, is_data=True)
     try:
@@ -99,10 +94,7 @@ def _working_space() -> Matrix:
 
 
 def set_srgb_view(scene: bpy.types.Scene) -> None:
-    """Show a scene on an sRGB display without tone mapping, look, exposure or gamma correction.
-
-    If the OpenColorIO config has no such display or view, the scene keeps its own.
-    """
+    """Show a scene on an sRGB display without tone mapping, look, exposure or gamma correction."""
     view = scene.view_settings
     _set_first(scene.display_settings, "display_device", _DISPLAYS)
     _set_first(view, "view_transform", _VIEWS)

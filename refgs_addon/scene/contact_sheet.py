@@ -69,7 +69,7 @@ def contact_sheet(
 
 
 def _pixels(file: Path):
-    """Read a PNG's RGBA values (h, w, 4) as they are stored, without colour conversion. The top row comes first."""
+    """Read a PNG's RGBA values (h, w, 4) as they are stored, top row first."""
     import numpy as np
 
     image = bpy.data.images.load(str(file))

@@ -83,7 +83,7 @@ def _parse(folder: Path, file: Path) -> list[Decision]:
 
 
 def find_decision(folder: Path, need: str) -> Decision:
-    """Find a run's decision about the optional part `need` of the training. Raises InputError if there is none with pictures."""
+    """Find a run's decision about the optional part `need`. Raises InputError where there is none."""
     for decision in decisions(folder):
         if decision.need == need:
             return decision
@@ -91,7 +91,7 @@ def find_decision(folder: Path, need: str) -> Decision:
 
 
 def open_decisions(scene: bpy.types.Scene, folder: Path) -> list[Decision]:
-    """List those decisions of a run (see `Decision`) that the artist has not confirmed in this scene."""
+    """List a run's decisions that the artist has not confirmed in this scene."""
     known = next((known for known in scene.refgs.runs if Path(known.folder) == folder), None)
     confirmed = set(known.confirmed.split()) if known else set()
     return [decision for decision in decisions(folder) if f"{decision.need}={decision.answer}" not in confirmed]

@@ -32,7 +32,7 @@ def add_points(splats: bpy.types.Object) -> bpy.types.Object:
 
 
 def points_of(splats: bpy.types.Object) -> bpy.types.Object | None:
-    """Find the mesh that `add_points` has made. Returns None if it was never made, or if the artist has deleted it."""
+    """Find the mesh that `add_points` has made, or return None if there is none."""
     modifier = splats.modifiers.get(NAME)
     return compat.get_modifier_input(modifier, "Points") if modifier else None
 

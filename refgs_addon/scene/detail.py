@@ -26,7 +26,7 @@ def set_detail(collection: bpy.types.Collection, level: float) -> None:
 
 
 def detail(collection: bpy.types.Collection) -> float:
-    """Return the fraction of a run's splats and triangles that are shown, 0 to 1 (see `set_detail`)."""
+    """Return the shown fraction of a run's splats and triangles, 0 to 1."""
     splats = parts(collection).get("splats", [])
     if not splats or SPLATS not in splats[0].modifiers:
         return 1.0

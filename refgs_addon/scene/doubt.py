@@ -14,20 +14,17 @@ DISPLAY = "Doubt"  # of the splats' modifier
 
 
 def has_doubt(collection: bpy.types.Collection) -> bool:
-    """Return True if a run's splats have the attribute `doubt`, 0..1.
-
-    Doubt is 1 where the photos do not show whether the surface is metal or paint.
-    """
+    """Check whether a run's splats have the attribute `doubt`."""
     return any("doubt" in splats.data.attributes for splats in parts(collection).get("splats", []))
 
 
 def doubt_words(collection: bpy.types.Collection) -> str:
-    """Return the trainer's sentence on how much of a run's surface could be metal or paint. Return "" if there is no such sentence."""
+    """Return the trainer's sentence on a run's doubt, or "" if there is none."""
     return collection.get(DOUBT, "")
 
 
 def doubt_shown(collection: bpy.types.Collection) -> bool:
-    """Return True if a run is coloured by its doubt (see `show_doubt`). Only the shown part of the run counts: the splats or the mesh."""
+    """Check whether the shown part of a run, splats or mesh, is coloured by doubt."""
     found = parts(collection)
     if shown(collection) == "mesh":
         return any(NAME in mesh.modifiers for mesh in found.get("mesh", []))

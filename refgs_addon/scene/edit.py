@@ -49,20 +49,17 @@ def add_edit(
 
 
 def edits(splats: bpy.types.Object) -> list[bpy.types.NodesModifier]:
-    """List the edits of the object `splats` in the order in which Blender applies them. An edit is a modifier that changes materials."""
+    """List the splats' edits, modifiers that change their materials, in the order Blender applies them."""
     return [m for m in splats.modifiers if m.type == "NODES" and m.node_group and m.node_group.name == NAME]
 
 
 def is_edited(splats: bpy.types.Object) -> bool:
-    """Return True if the splats have an edit of their materials, or if any splat was deleted."""
+    """Check whether the splats' materials are edited, or any splat was deleted."""
     return bool(edits(splats)) or count_deleted(splats) > 0
 
 
 def remove_edit(splats: bpy.types.Object, name: str) -> None:
-    """Remove the edit (modifier) `name`. Also remove the object that marks its region, unless another edit uses this object.
-
-    Raises InputError if the splats have no such edit.
-    """
+    """Remove an edit and the region that only it uses. Raises InputError for unknown edits."""
     edit = splats.modifiers.get(name)
     if edit is None or edit not in edits(splats):
         raise InputError(f"{splats.name} has no edit {name}")
@@ -82,10 +79,7 @@ def splats_of(collection: bpy.types.Collection) -> bpy.types.Object:
 
 
 def _region(splats: bpy.types.Object, collection: bpy.types.Collection, where: str) -> bpy.types.Object:
-    """Make an Empty in the middle of the splats that marks where an edit applies.
-
-    Its sides are a third of the longest side of the box around the splats. For "Similar", which needs only one point, they are a sixth.
-    """
+    """Add an Empty in the middle of the splats that marks where an edit applies."""
     shape = {"Box": "CUBE", "Sphere": "SPHERE", "Similar": "ARROWS"}[where]
     region = add_region(splats, collection, f"{where} of {splats.name}", shape)
     region.scale = [max(region.scale) * (1 / 6 if where == "Similar" else 1 / 3)] * 3
@@ -93,10 +87,9 @@ def _region(splats: bpy.types.Object, collection: bpy.types.Collection, where: s
 
 
 def _paint_target(mesh: bpy.types.Object, collection: bpy.types.Collection) -> tuple[bpy.types.Object, str]:
-    """Make an object on which the artist paints where an edit applies, or reuse it. Add a vertex group for the new edit.
+    """Return an object to paint on, and the name of its new vertex group.
 
-    Returns the object and the name of the group. The object shares the data of the mesh, but has no modifiers. The modifiers of the mesh
-    itself depend on the painted weights: painting there would make a cycle.
+    It shares the mesh's data, but has no modifiers: those of the mesh depend on the painted weights, which would make a cycle.
     """
     found = [item for item in collection.objects if item.get(REGION) and item.data == mesh.data]
     if found:

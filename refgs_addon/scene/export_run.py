@@ -131,10 +131,7 @@ def export_run(collection: bpy.types.Collection, folder: Path) -> None:
 
 
 def export_light(collection: bpy.types.Collection, path: Path) -> None:
-    """Copy the light recovered from a run's photos, an equirectangular EXR, to `path`.
-
-    Raises InputError if the run has no such file, or the copy cannot be written.
-    """
+    """Copy a run's recovered light, an equirectangular EXR, to `path`. Raises InputError."""
     light = run_folder(collection) / "environment.exr"
     if not light.is_file():
         raise InputError(f"{light} does not exist: the run has no light")
@@ -164,7 +161,7 @@ def _copy(file: Path, path: Path) -> None:
 
 
 def run_folder(collection: bpy.types.Collection) -> Path:
-    """Find the run folder that a collection was imported from. Raises InputError where the folder is missing."""
+    """Find the run folder of an imported collection. Raises InputError where it is missing."""
     folder = Path(bpy.path.abspath(collection.get(FOLDER, "")))
     if not collection.get(FOLDER) or not (folder / "splats.ply").is_file():
         raise InputError(f"the run of {collection.name} is no longer at {folder}: import it again from its new place")

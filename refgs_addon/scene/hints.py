@@ -77,10 +77,7 @@ def write_hint(file: Path, kind: str, points: np.ndarray) -> None:
 
 
 def _hit(splats: bpy.types.Object, origin: np.ndarray, direction: np.ndarray) -> int | None:
-    """Return the index of the splat at which half of the light along a ray is blocked. The ray is in the splats' coordinates.
-
-    If all splats together block less, return the last one that the ray hits. Return None if it hits no splat.
-    """
+    """Return the index of the splat that a ray (in object space) hits, or None."""
     position, scale = (_attribute(splats, name, "vector", 3) for name in ("position", "scale"))
     axes = splat_axes(_attribute(splats, "rotation", "value", 4))
     normal = np.cross(*axes)
@@ -99,11 +96,7 @@ def _hit(splats: bpy.types.Object, origin: np.ndarray, direction: np.ndarray) ->
 
 
 def _smooth_part(splats: bpy.types.Object, seed: int) -> np.ndarray:
-    """Find the splats that a surface without creases connects to the splat with the index `seed`. Returns a mask (N,).
-
-    Neighbours are connected if their normals agree, and if the line between them runs along the surface. A splat is also selected if most
-    of its neighbours are selected. A splat with an opacity below 0.2 is selected if the nearest splat above 0.2 is selected.
-    """
+    """Return a mask (N,) of the splats that a crease-free surface connects to the `seed`."""
     position, normal = (_attribute(splats, name, "vector", 3) for name in ("position", "normal"))
     solid = _attribute(splats, "opacity", "value", 1)[:, 0] >= SOLID
     solid[seed] = True
@@ -132,13 +125,13 @@ def _smooth_part(splats: bpy.types.Object, seed: int) -> np.ndarray:
 
 
 def _to_world(splats: bpy.types.Object) -> Matrix:
-    """Return the matrix from the splats' coordinates to world space. It is right for hidden splats, too, unlike their `matrix_world`."""
+    """Return the matrix from the splats' coordinates to world space, even for hidden splats."""
     local = splats.matrix_parent_inverse @ splats.matrix_basis
     return splats.parent.matrix_world @ local if splats.parent else splats.matrix_basis.copy()
 
 
 def _attribute(splats: bpy.types.Object, name: str, field: str, width: int) -> np.ndarray:
-    """Read an attribute of the splats as float32 (N, width). `field` is the property that has its values: "vector" or "value"."""
+    """Read the values of an attribute as float32 (N, width); `field` is "vector" or "value"."""
     attribute = splats.data.attributes[name]
     values = np.empty(width * len(attribute.data), np.float32)
     attribute.data.foreach_get(field, values)

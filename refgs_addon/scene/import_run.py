@@ -26,7 +26,7 @@ DEPTH = 0.005  # of a mesh under the splats, as a part of the run's longest side
 
 @dataclass
 class Run:
-    """Hold the objects that `import_run` made. What the run folder does not contain is None or empty here."""
+    """Hold the objects that `import_run` made, None or empty if the run lacks them."""
 
     collection: bpy.types.Collection
     root: bpy.types.Object
@@ -106,7 +106,7 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
 
 
 def add_root(name: str, splats: bpy.types.Object, mesh: list[bpy.types.Object]) -> bpy.types.Object:
-    """Add the Empty that moves, rotates and scales a run. It stands at the centre of the bottom of the box around the run."""
+    """Add the Empty that moves, rotates and scales a run, at its bottom centre."""
     low, high = extent(splats, mesh)
     item = bpy.data.objects.new(name, None)
     item.location = (low.x + high.x) / 2, (low.y + high.y) / 2, low.z
@@ -186,10 +186,7 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
 
 
 def _doubt_words(folder: Path) -> str:
-    """Read the trainer's sentence on how much of a run's surface could be metal or paint.
-
-    It is in the run's metrics.json. Returns "" if there is no such sentence.
-    """
+    """Read the trainer's sentence on a run's doubt from metrics.json, or "" if none."""
     try:
         return str(read_json(folder / "metrics.json")["doubt"]["what"])
     except (InputError, KeyError, TypeError):  # not there, of an older release, or half copied
@@ -197,10 +194,7 @@ def _doubt_words(folder: Path) -> str:
 
 
 def _occlusion(material: bpy.types.Material) -> bpy.types.NodeSocket | None:
-    """Find the output socket with the ambient occlusion in a material that Blender's glTF importer made.
-
-    The importer links this output to a group node that Blender does not render. Returns None if the material has no ambient occlusion.
-    """
+    """Find the output with the ambient occlusion of an imported glTF material, or None."""
     inputs = (node.inputs.get("Occlusion") for node in material.node_tree.nodes if node.type == "GROUP")
     return next((socket.links[0].from_socket for socket in inputs if socket and socket.links), None)
 

@@ -64,10 +64,7 @@ def update() -> None:
 
 
 def _read(path: Path) -> dict | None:
-    """Read a preview's splats as attributes for `point_cloud`. Returns None if the file cannot be read.
-
-    Normals are constant across each splat here. Computing how they change would take longer than everything else.
-    """
+    """Read a preview's splats as attributes for `point_cloud`. Returns None if they cannot be read."""
     import numpy as np
 
     from .splat_cloud import cloud_attributes, read_splats

@@ -18,7 +18,7 @@ INPUTS = ("Base Color", "Color Amount", "Metallic", "Metallic Amount", "Roughnes
 
 
 def materials() -> dict[str, Path]:
-    """Map the names of all material presets to their files. If a name occurs twice, the artist's preset is used."""
+    """Map all material presets' names to their files; the artist's presets take precedence."""
     folders = [ROOT / "presets" / PRESETS, *map(Path, bpy.utils.preset_paths(PRESETS)), _user_folder()]
     files = (file for folder in folders for file in folder.glob("[!.]*.py"))
     found = {bpy.path.display_name(file.name, title_case=False): file for file in files}
@@ -41,18 +41,18 @@ def read_material(name: str) -> dict[str, float | tuple[float, ...]]:
 
 
 def set_material(edit: bpy.types.NodesModifier, name: str) -> None:
-    """Set the values of an edit to those of the preset `name`. Raises InputError if the preset is missing or invalid."""
+    """Apply a material preset to an edit. Raises InputError where it is missing or invalid."""
     set_inputs(edit, read_material(name))
 
 
 def set_inputs(edit: bpy.types.NodesModifier, values: dict[str, float | tuple[float, ...]]) -> None:
-    """Set inputs of an edit. `values` maps the names of the inputs to their new values, as `read_material` returns them."""
+    """Set an edit's inputs by name, with the base colour in linear Rec.709."""
     for name, value in values.items():
         compat.set_modifier_input(edit, name, from_rec709(value) if name == "Base Color" else value)
 
 
 def save_material(edit: bpy.types.NodesModifier, name: str) -> Path:
-    """Save the values of an edit as a new preset. Raises InputError if the name is empty or exists already."""
+    """Save an edit as a preset. Raises InputError where the name is empty or taken."""
     stem = AddPresetBase.as_filename(name)
     if not stem:
         raise InputError("the material has no name: type one first")
@@ -94,10 +94,7 @@ def _identifier(name: str) -> str:
 
 
 def _rounded(name: str, value) -> float | tuple[float, ...]:
-    """Round a value of an edit to six decimals. `name` is the edit's input: "Base Color" has four numbers, every other input one.
-
-    Blender stores numbers in single precision: a typed 0.2 comes back as 0.20000000298.
-    """
+    """Round a value of an edit's input `name` to six decimals."""
     if name == "Base Color":
         r, g, b, alpha = value
         return tuple(round(float(part), 6) for part in (r, g, b, alpha))

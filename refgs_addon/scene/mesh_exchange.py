@@ -71,15 +71,12 @@ def write_mesh(mesh: Path, path: Path, engine: str = "Any Program") -> None:
 
 
 def _specular(item: bpy.types.Object) -> float:
-    """Return the Specular IOR Level of an imported mesh's material, or 0 for a material without specular reflection."""
+    """Return the Specular IOR Level of an imported mesh's material."""
     return principled(item.data.materials[0]).inputs[SPECULAR].default_value
 
 
 def _material(name: str, folder: Path, specular: float) -> bpy.types.Material:
-    """Make a Principled BSDF material that reads each input from its own texture.
-
-    No input takes a single channel of a texture: FBX cannot select a channel, and both exporters ignore the nodes that could.
-    """
+    """Make a Principled BSDF material that reads each input from its own texture."""
     material = bpy.data.materials.new(name)
     tree, inputs = node_tree(material), {SPECULAR: specular}
     for picture, socket in _PICTURES.items():
@@ -95,11 +92,7 @@ def _material(name: str, folder: Path, specular: float) -> bpy.types.Material:
 
 
 def _pack(path: Path, folder: Path, channels: tuple[tuple[str, int], ...]) -> None:
-    """Write a PNG that takes each of its channels from a texture in `folder`.
-
-    `channels` has a pair for each channel: the texture's name without suffix, and the index of the texture's channel. If the name begins
-    with "-", the values are inverted (1 − value).
-    """
+    """Write a PNG from (texture, channel index) pairs, inverted if the name begins with "-"."""
     import numpy as np  # Debian's Blender may lack it
 
     found = []

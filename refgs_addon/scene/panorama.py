@@ -72,7 +72,7 @@ def diffuse_light(image: bpy.types.Image, rotation: Sequence[float]) -> tuple[np
 
 
 def _reduced(image: bpy.types.Image) -> np.ndarray:
-    """Resample a panorama to (ROWS, 2 · ROWS, 3) pixels in the working space, by area averaging. The bottom row comes first."""
+    """Resample a panorama to (ROWS, 2·ROWS, 3) in the working space, bottom row first."""
     width, height = image.size
     pixels = np.empty(width * height * image.channels, np.float32)
     image.pixels.foreach_get(pixels)

@@ -13,7 +13,7 @@ Box = tuple[Vector, Vector]  # lowest and highest corner, in world space
 
 
 def extent(splats: bpy.types.Object, meshes: list[bpy.types.Object]) -> Box:
-    """Return the box around a run's mesh. Without a mesh, return the box around most of its splats. Call this before the run is moved."""
+    """Return the box around an unmoved run: its mesh, or else most of its splats."""
     solid = [item for item in meshes if item.data.polygons]
     return _box(solid) if solid else bounds(splats.data)
 

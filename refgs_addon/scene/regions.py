@@ -35,7 +35,7 @@ def add_region(splats: bpy.types.Object, collection: bpy.types.Collection, name:
 
 
 def bounds(cloud: bpy.types.PointCloud) -> tuple[Vector, Vector]:
-    """Return the lowest and the highest corner of the box around a point cloud. 2 % of the points may lie beyond each side of the box."""
+    """Return a point cloud's lowest and highest corner without 2 % of points per side."""
     places = [0.0] * (3 * len(cloud.points))
     cloud.attributes["position"].data.foreach_get("vector", places)
     axes = [sorted(places[axis::3]) for axis in range(3)]
@@ -60,7 +60,7 @@ def crop(splats: bpy.types.Object, collection: bpy.types.Collection, on: bool) -
 
 
 def training_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Find the training box, which limits what is trained. Returns None if none was chosen or the box was deleted."""
+    """Find the box that limits what is trained, or return None if there is none."""
     box = scene.refgs.region
     return box if box is not None and scene in box.users_scene else None
 
@@ -126,7 +126,7 @@ def show_found_region(scene: bpy.types.Scene, settings: list[str]) -> bpy.types.
 
 
 def artists_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Find the training box if an artist made or changed it. Returns None if there is no box, or if only the program placed it."""
+    """Return the training box if the artist made or changed it, else None."""
     box = training_region(scene)
     if box is None or FOUND not in box:
         return box
@@ -144,7 +144,7 @@ def _new_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def _world_matrix(scene: bpy.types.Scene, box: bpy.types.Object) -> Matrix:
-    """Return the matrix from an object's local coordinates to world space. It is up to date even if the object was just moved or hidden."""
+    """Return an object's current matrix to world space, even if it is hidden."""
     hidden, box.hide_viewport = box.hide_viewport, False  # Blender does not evaluate hidden objects
     for layer in scene.view_layers:
         layer.update()

@@ -53,7 +53,7 @@ def start_blender(name: str, log: str, command: Mapping[str, object], file: str 
 
 
 def _save_copy(path: str) -> None:
-    """Save a copy of the open file without a thumbnail. For the thumbnail Blender would render the scene, which takes time."""
+    """Save a copy of the open file without a thumbnail."""
     preferences = bpy.context.preferences
     kind, changed = preferences.filepaths.file_preview_type, preferences.is_dirty
     preferences.filepaths.file_preview_type = "NONE"

@@ -11,7 +11,7 @@ DOUBT = "refgs_doubt"  # custom property of a run's collection: the trainer's wo
 
 
 def parts(collection: bpy.types.Collection) -> dict[str, list[bpy.types.Object]]:
-    """Return the objects of an imported run as {"splats": [objects], "mesh": [objects]}. For any other collection return {}."""
+    """Return a run's objects under "splats" and "mesh", or {} for any other collection."""
     found: dict[str, list[bpy.types.Object]] = {}
     for item in collection.objects:
         if KEY in item:
@@ -20,7 +20,7 @@ def parts(collection: bpy.types.Collection) -> dict[str, list[bpy.types.Object]]
 
 
 def root(collection: bpy.types.Collection) -> bpy.types.Object | None:
-    """Find the Empty that moves, rotates and scales an imported run. Returns None if it was deleted."""
+    """Find the Empty that moves an imported run, or return None if it was deleted."""
     return next((item for item in collection.objects if ROOT in item), None)
 
 
@@ -49,16 +49,13 @@ def shown(collection: bpy.types.Collection) -> str:
 
 
 def stand_with(item: bpy.types.Object, other: bpy.types.Object) -> None:
-    """Give the object `item` the parent and local transform of the object `other`. They then stand in one place and move together."""
+    """Give `item` the parent and local transform of `other`."""
     item.parent, item.matrix_parent_inverse = other.parent, other.matrix_parent_inverse
     item.matrix_basis = other.matrix_basis
 
 
 def active_run(context: bpy.types.Context) -> bpy.types.Collection | None:
-    """Find the collection of the imported run that contains the active object. If no run does, return the scene's newest run.
-
-    Returns None if the scene has no run.
-    """
+    """Find the active object's run, or the scene's newest. Returns None if there is none."""
     runs = [collection for collection in context.scene.collection.children if parts(collection)]
     chosen = context.view_layer.objects.active
     of_chosen = [run for run in runs if chosen is not None and chosen.name in run.all_objects]

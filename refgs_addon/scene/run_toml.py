@@ -10,13 +10,13 @@ MANIFEST = Path(__file__).resolve().parents[2] / "blender_manifest.toml"
 
 
 def capture_of(run: Path) -> Path | None:
-    """Return the folder of the capture that a run was trained on, or None if run.toml does not say."""
+    """Return the folder of the capture that a run was trained on, or None."""
     capture = _table(run, "run").get("capture")
     return Path(capture) if isinstance(capture, str) else None
 
 
 def up_was_chosen(run: Path) -> bool:
-    """Check whether the artist chose a new up direction for the run. The run is then rotated relative to the capture's cameras."""
+    """Check whether the artist's up direction rotated a run relative to its capture's cameras."""
     try:
         x, y, z = map(float, _table(run, "settings")["region"]["up"])
         return math.hypot(x, y) > 1e-3 * z and any((x, y, z))
@@ -25,7 +25,7 @@ def up_was_chosen(run: Path) -> bool:
 
 
 def newer_release(run: Path) -> str:
-    """Return the release of RefGS that trained a run, if it is newer than this add-on, else ""."""
+    """Return the RefGS release that trained a run if newer than the add-on, else ""."""
     made_by = _table(run, "run").get("refgs")
     own = tomllib.loads(MANIFEST.read_text(encoding="utf-8"))["version"]
     try:

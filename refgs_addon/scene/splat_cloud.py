@@ -168,10 +168,7 @@ def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
 
 
 def _flatten_gaussians(rotation: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Flatten 3D Gaussians to discs: permute the axes so that the shortest comes third, and drop its scale.
-
-    Returns quaternions wxyz (N, 4) and the other two scales (N, 2).
-    """
+    """Flatten 3D Gaussians to discs, with quaternions wxyz (N, 4) and scales (N, 2)."""
     shortest = np.where(scale[:, 2] <= scale.min(axis=1), 2, scale.argmin(axis=1))
     # Rotations that bring x, y or z to the third axis.
     turns = np.array([(0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1, 0, 0, 0)], np.float32)
@@ -229,7 +226,7 @@ def read_constants(path: Path) -> dict[str, float]:
 
 
 def splat_axes(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the two axes of each splat, unit vectors (N, 3): the first two columns of the matrices of unit quaternions wxyz (N, 4)."""
+    """Return the two axes (N, 3) of splats from their unit quaternions wxyz (N, 4)."""
     w, x, y, z = rotation.T
     return (
         np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1),
@@ -288,14 +285,7 @@ def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
 
 
 def _morton_order(position: np.ndarray, shift: float) -> np.ndarray:
-    """Sort points (N, 3) along a Morton curve. Returns their indices in that order.
-
-    The curve fills a cube whose side is twice that of the points' bounding cube. `shift` moves the points in the larger cube, by a fraction
-    of its side.
-
-    Points that lie close together can be far apart along one curve. Along a second curve, with another `shift`, they are likely to be
-    close.
-    """
+    """Argsort points (N, 3) along a Morton curve shifted by a fraction of its cube."""
     low = position.min(axis=0)
     cells = (position - low) / max((position - low).max(), 1e-30) / 2 + np.float32(shift)
     key = np.zeros(len(position), np.uint64)

@@ -31,7 +31,7 @@ TURNS = {3: 2, 6: 3, 8: 1}  # quarter turns, counter-clockwise, that an EXIF ori
 
 
 def camera_with_photo(context: bpy.types.Context) -> bpy.types.Object | None:
-    """Find the camera whose photo is painted on: the active object, otherwise the scene's camera. Returns None if neither has a photo."""
+    """Find the camera with a photo: the active object, else the scene's camera, or None."""
     for item in (context.view_layer.objects.active, context.scene.camera):
         if item is not None and item.type == "CAMERA" and item.data.get(PHOTO):
             return item
@@ -39,7 +39,7 @@ def camera_with_photo(context: bpy.types.Context) -> bpy.types.Object | None:
 
 
 def canvases() -> list[bpy.types.Image]:
-    """List the canvases in the open .blend file: images on which the artist paints strokes over a photo."""
+    """List the open file's canvases, images on which the artist paints strokes over photos."""
     return [image for image in bpy.data.images if STROKES in image]
 
 
@@ -66,17 +66,14 @@ def add_canvas(capture: Path, camera: bpy.types.Object) -> bpy.types.Image:
 
 
 def show_masks(capture: Path) -> None:
-    """Show the present masks on the canvases (images for painting strokes) of a capture. All strokes stay, even unsaved ones."""
+    """Show the present masks on a capture's canvases, and keep all strokes."""
     for canvas in canvases():
         if canvas[CAPTURE] == str(masks_root(capture)):
             _draw(canvas, _read_photo(Path(canvas[PHOTO]), *canvas.size), _strokes(canvas))
 
 
 def save(capture: Path) -> list[Path]:
-    """Write the strokes on the canvases of a capture, and return the files. A file whose strokes were erased becomes all transparent.
-
-    Raises InputError if nothing was painted.
-    """
+    """Write the strokes on a capture's canvases to files. Raises InputError where nothing was painted."""
     files = []
     for canvas in canvases():
         strokes, file = _strokes(canvas), Path(canvas[STROKES])
@@ -101,11 +98,7 @@ def masks_root(capture: Path) -> Path:
 
 
 def _name_in(capture: Path, photo: Path) -> Path:
-    """Return the path of the file with a photo's strokes, relative to the folder `strokes`.
-
-    It is the photo's path in the folder of photos, with the suffix .png. If another photo differs only in its suffix, the photo's own
-    suffix stays: a.jpg.png. Raises InputError if the photo is not in the folder `capture`.
-    """
+    """Return the relative path of a photo's strokes. Raises InputError unless `capture` has the photo."""
     try:
         inner = photo.resolve().relative_to(capture.resolve())
     except ValueError:
@@ -128,10 +121,7 @@ def _mask_file(canvas: bpy.types.Image) -> Path | None:
 
 
 def _draw(canvas: bpy.types.Image, picture: "np.ndarray", strokes: "np.ndarray | None") -> None:
-    """Write a canvas's pixels: the photo, reddened where its mask is black, and the strokes over it.
-
-    `picture` is the photo and `strokes` the strokes, both RGBA (height, width, 4), top row first.
-    """
+    """Fill a canvas with its photo and strokes, RGBA (height, width, 4), top row first."""
     import numpy as np
 
     width, height = canvas.size
@@ -150,7 +140,7 @@ def _draw(canvas: bpy.types.Image, picture: "np.ndarray", strokes: "np.ndarray |
 
 
 def _strokes(canvas: bpy.types.Image) -> "np.ndarray":
-    """Return the strokes on a canvas as RGBA (height, width, 4) float32, top row first: white, black or transparent."""
+    """Return a canvas's white or black strokes as RGBA (height, width, 4), top row first."""
     import numpy as np
 
     pixels = _pixels(canvas)
@@ -172,10 +162,7 @@ def _pixels(image: bpy.types.Image) -> "np.ndarray":
 
 
 def _read(path: Path, width: int, height: int, turns: int = 0) -> "np.ndarray":
-    """Read a picture file as RGBA, top row first. Raises InputError if Blender cannot open it.
-
-    The picture is turned counter-clockwise by `turns` quarter turns. The result has `width` × `height` pixels.
-    """
+    """Read a picture as RGBA, top row first, after `turns` counter-clockwise quarter turns. Raises InputError."""
     import numpy as np
 
     try:
@@ -200,7 +187,7 @@ def _read_photo(path: Path, width: int, height: int) -> "np.ndarray":
 
 
 def exif_orientation(path: Path) -> int:
-    """Return the EXIF orientation of a JPEG file, 1 to 8; 1 if the file says nothing. Blender itself ignores it."""
+    """Return the EXIF orientation of a JPEG file, 1 to 8, or 1 without one."""
     try:
         with open_file(path) as file:
             data = file.read(1 << 17)

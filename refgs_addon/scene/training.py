@@ -94,12 +94,7 @@ def make_masks(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def _show_masks(number: int, capture: Path, found: dict) -> None:
-    """Show the masks that the trainer has just made, on the canvases for strokes. Also move the training box.
-
-    The coordinate frame of a training depends on the masks. A box that the artist placed moves with the frame, so that it stays around the
-    object. Otherwise the box moves to where the trainer found the object. `found` is the trainer's result: `region` has the settings of the
-    new box, and `moved` the matrix from the earlier frame to the new one. `number` is the scene's `session_uid`.
-    """
+    """Show new masks, and move the scene's training box by the trainer's result `found`."""
     strokes.show_masks(capture)
     if known := _scene(number):
         box = artists_region(known)
@@ -110,10 +105,7 @@ def _show_masks(number: int, capture: Path, found: dict) -> None:
 
 
 def save_strokes(scene: bpy.types.Scene) -> jobs.Job:
-    """Write the strokes that were painted on photos of the scene's capture, and make its masks anew.
-
-    Raises InputError if nothing was painted, or if there is no trainer.
-    """
+    """Save the capture's strokes, and start a job that makes its masks anew. Raises InputError."""
     python()  # say that there is none before anything is written
     strokes.save(_capture(scene))
     return make_masks(scene)
@@ -184,7 +176,7 @@ def train(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def _train(scene: bpy.types.Scene, out: Path, changes: dict[str, object]) -> jobs.Job:
-    """Start a job that trains into the folder `out` with the scene's settings and some `changes` of the trainer's settings."""
+    """Start a training into `out` with the scene's settings and `changes` of the trainer's settings."""
     settings, capture = scene.refgs, _capture(scene)
     preset, minutes = (None, settings.minutes) if settings.limited else (settings.preset, None)
     asked = jobs.Asked(capture, out, preset, minutes, region_settings(scene) | _choices(settings) | changes)
@@ -242,7 +234,7 @@ def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.
 
 
 def resume(scene: bpy.types.Scene, folder: Path) -> jobs.Job:
-    """Start a job that resumes a stopped run of the scene's list. Raises InputError if the run is not stopped or not in the list."""
+    """Resume a run of the scene's list. Raises InputError where it is not stopped."""
     known = next((known for known in scene.refgs.runs if Path(known.folder) == folder), None)
     state = jobs.run_state(folder)
     if state == "training":
@@ -265,7 +257,7 @@ def forget(scene: bpy.types.Scene, folder: Path) -> None:
 
 
 def _choices(settings: bpy.types.PropertyGroup) -> dict[str, object]:
-    """Return the settings that the artist chose, as {trainer's name of the setting: value}. Leave out settings whose value is "auto"."""
+    """Return the trainer's settings that the artist chose, by name, without those on "auto"."""
     chosen = {
         "surfels.budget": settings.splats or "auto",
         "light.frame": settings.light,
@@ -283,7 +275,7 @@ def _remember(scene: bpy.types.Scene, run: Path, capture: Path | None = None) ->
 
 
 def _trained_capture(scene: bpy.types.Scene, run: Path) -> Path | None:
-    """Return the capture that a run was trained on, from the scene's list or from run.toml. Return None if neither names it."""
+    """Return the capture that a run was trained on, or None if it is unknown."""
     known = next((known.capture for known in scene.refgs.runs if Path(known.folder) == run), "")
     return Path(known) if known else capture_of(run)
 
@@ -303,12 +295,12 @@ def _scene(number: int) -> bpy.types.Scene | None:
 
 
 def _free_folder(capture: Path, scene: bpy.types.Scene) -> Path:
-    """Return a path for a new run folder beside the capture. Nothing exists there, and no run of the scene's list uses it."""
+    """Return an unused path for a new run folder beside the capture."""
     return _free(capture.with_name(f"{capture.name} RefGS"), {Path(known.folder) for known in scene.refgs.runs})
 
 
 def _free(wanted: Path, taken: set[Path]) -> Path:
-    """Return the path `wanted`, with a number after it if something exists there or it is `taken`."""
+    """Return the path `wanted`, with a number after it if it exists or is `taken`."""
     number, out = 1, wanted
     while out in taken or out.exists():
         number += 1

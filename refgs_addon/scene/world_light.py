@@ -35,7 +35,7 @@ def load_panorama(path: Path) -> bpy.types.Image:
 
 
 def light_with_recovered(scene: bpy.types.Scene, name: str, image: bpy.types.Image) -> bpy.types.World:
-    """Give the scene a new world that shows `image`, the panorama of light recovered from a run's photos."""
+    """Give the scene a new world with `image`, the panorama of a run's recovered light."""
     world = panorama_world(name)
     world[RECOVERED] = image
     world.node_tree.nodes[IMAGE].image = image

@@ -61,7 +61,7 @@ class Quit(ReportsErrors, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Enable this operator only while trainings run or wait. Otherwise the quit key works as in plain Blender."""
+        """Enable this operator only while trainings run or wait."""
         cls.poll_message_set("Nothing is being trained")
         return bool(jobs.trainings())
 
@@ -87,13 +87,13 @@ class Quit(ReportsErrors, bpy.types.Operator):
 
 
 def quit_question() -> str:
-    """Return the title of the dialog that asks before quitting, such as "A training is running"."""
+    """Return the title of the dialog that asks before quitting."""
     number = len(jobs.trainings())
     return "A training is running" if number == 1 else f"{number} trainings are running or waiting"
 
 
 def draw_quit(self, context: bpy.types.Context) -> None:
-    """Draw an entry in the File menu, below Blender's own Quit, that asks before it quits. Draws it only while a training runs or waits."""
+    """Draw a File menu entry that asks before quitting while a training runs or waits."""
     if jobs.trainings():
         self.layout.operator_context = "INVOKE_DEFAULT"
         self.layout.operator(Quit.bl_idname, text="Quit with Trainings Running…", icon="QUIT")

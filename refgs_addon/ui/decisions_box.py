@@ -23,11 +23,7 @@ PICTURE = 0.11  # lines of height for each letter of width: pictures fill a thir
 
 
 class _OnDecision(OnRunFolder):
-    """Store the decision that an operator works on. Base class of these operators.
-
-    `folder` is the run folder. `need` names the optional part of the method, such as specular reflection, that the training kept or
-    dropped.
-    """
+    """Store the decision that an operator works on, about the optional part `need`."""
 
     need: StringProperty(name="Need")
 

@@ -15,12 +15,12 @@ from .operators import ReportsErrors, import_run_folder
 
 
 class _Drop(ReportsErrors):
-    """Store the path of a dropped file. Base class of the operators that handle the file."""
+    """Store the path of a dropped file for the operators that handle it."""
 
     filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
 
     def folder(self, name: str) -> Path:
-        """Return the dropped file's folder. Raises InputError where the file's name does not begin with `name`."""
+        """Return the dropped file's folder. Raises InputError unless the file's name begins with `name`."""
         file = Path(bpy.path.abspath(self.filepath))
         if not file.name.startswith(name):
             raise InputError(
@@ -50,7 +50,7 @@ class DropCapture(_Drop, bpy.types.Operator):
 
 
 class _OnView:
-    """Accept files only if they are dropped on the 3D view. Base class of the file handlers."""
+    """Let file handlers accept only files that are dropped on the 3D view."""
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:

@@ -13,10 +13,7 @@ from .operators import ImportRun, OnRun, has_trainer
 
 
 class _Export(OnRun, ExportHelper):
-    """Ask for a file, and export the active run to it. Base class of the export operators.
-
-    `kind` says what is exported, such as "splats", "mesh" or "light".
-    """
+    """Export a part (`kind`, such as "mesh") of the active run to a chosen file."""
 
     bl_options: ClassVar = {"REGISTER"}
 
@@ -30,7 +27,7 @@ class _Export(OnRun, ExportHelper):
         return {"RUNNING_MODAL"}
 
     def chosen(self) -> dict[str, str]:
-        """Return the artist's choices other than the file, as keyword arguments of the function that writes the file."""
+        """Return the artist's choices as keyword arguments of the function that writes the file."""
         return {}
 
     def work(self, context: bpy.types.Context) -> None:

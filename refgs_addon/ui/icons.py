@@ -25,7 +25,7 @@ _drawn: dict[int, tuple[int, int]] = {}  # number of points in the drawn curve b
 
 
 def preview_icon(job: jobs.Job) -> int:
-    """Return the number of the icon with a training job's newest preview picture, or 0 if there is none yet."""
+    """Return the icon number of a training's newest preview, or 0 without one."""
     if not job.preview or _pictures is None:
         return 0
     key = f"{job.serial} {job.preview['iteration']}"

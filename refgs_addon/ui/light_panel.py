@@ -38,11 +38,7 @@ def _lights(self, context: bpy.types.Context) -> list[tuple[str, str, str, int, 
 
 
 def _number(file: Path) -> int:
-    """Compute the number of a panorama file in the menu of lights, as a hash of the file's path.
-
-    Because it is a hash, the number stays the same when other files are added to the folder or removed. It is at least 2, because the menu
-    uses 0 for the recovered light and 1 (OTHER) for a light that is not in the list.
-    """
+    """Compute a panorama's number in the menu of lights, at least 2, from its path."""
     return 2 + crc32(str(file).encode()) % (1 << 30)
 
 
@@ -142,10 +138,7 @@ CLASSES = (Relight, RecoveredLight, MatchLight, LightPanel)
 
 @bpy.app.handlers.persistent
 def _follow_world(scene: bpy.types.Scene, *_) -> None:
-    """Update the diffuse light that imported runs have in Eevee, if the world was rotated or replaced.
-
-    Blender calls this after every change of the scene and of the frame.
-    """
+    """Update imported runs' diffuse light in Eevee after the world was rotated or replaced."""
     correct_diffuse(scene)
 
 

@@ -132,10 +132,7 @@ class ManyPanel(Tab, bpy.types.Panel):
 
 
 def _draw_batch(box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
-    """Draw the progress and the buttons of a batch (the training of many captures) that this Blender started.
-
-    `width` is how many letters fit into a line.
-    """
+    """Draw the progress and buttons of this Blender's batch on lines of `width` letters."""
     head = box.row()
     icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE"}.get(job.state, "SORTTIME")
     head.label(text=job.name, icon=icon)
@@ -156,10 +153,7 @@ def _draw_batch(box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
 
 
 def _draw_other_process(box: bpy.types.UILayout, context: bpy.types.Context, folder: Path) -> None:
-    """Draw the progress of a batch (the training of many captures) that another process runs, and a button that stops the batch.
-
-    `folder` is the folder of the batch's runs.
-    """
+    """Draw another process's batch: its progress, and a button that stops it."""
     states = [row.state for row in context.window_manager.refgs_rows] if batch_table.is_shown(folder) else []
     done, failed, stopping = states.count("done"), states.count("failed"), jobs.stop_requested(folder / jobs.LOGS)
     text = "Stopping" if stopping else count_words(done, len(states), failed) if states else "Starting"
@@ -170,10 +164,7 @@ def _draw_other_process(box: bpy.types.UILayout, context: bpy.types.Context, fol
 
 
 def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, folder: Path, width: int) -> None:
-    """Draw the table of the runs in `folder`, and below it the selected run's error, or a button that imports this run.
-
-    A last button makes all finished runs assets. `width` is how many letters fit into a line.
-    """
+    """Draw the table of a batch's runs, and the selected run's error or import button."""
     manager = context.window_manager
     layout.template_list(RunList.bl_idname, "", manager, "refgs_rows", manager, "refgs_row", rows=ROWS)
     row = batch_table.chosen_row(folder)
@@ -189,10 +180,7 @@ def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, folder: 
 
 
 def _draw_library(box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
-    """Draw the progress or the result of a job that turns runs into assets for the asset browser.
-
-    `width` is how many letters fit into a line.
-    """
+    """Draw the progress or the result of a job that turns runs into assets."""
     row = box.row()
     row.label(text=job.name, icon={"done": "CHECKMARK", "failed": "ERROR"}.get(job.state, "SORTTIME"))
     row.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).serial = job.serial

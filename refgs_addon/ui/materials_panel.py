@@ -65,10 +65,7 @@ class AddEdit(OnRun, bpy.types.Operator):
 
 
 class _OfEdit(ReportsErrors):
-    """Store the edit that an operator works on. Base class of these operators.
-
-    An edit is a modifier that changes the materials of splats. `splats` is the name of their object, and `edit` the name of the modifier.
-    """
+    """Store the edit (a modifier of the object `splats`) that an operator works on."""
 
     splats: StringProperty(name="Splats", options={"HIDDEN"})
     edit: StringProperty(name="Edit", options={"HIDDEN"})

@@ -26,7 +26,7 @@ from ..scene.world_light import hdris
 
 
 class ReportsErrors:
-    """Call the operator's method `work`, and show an InputError as one line. Base class of all operators."""
+    """Call the operator's method `work`, and show an InputError as one line."""
 
     bl_options: ClassVar = {"REGISTER", "UNDO"}
 
@@ -72,7 +72,7 @@ class OnCapture(ReportsErrors):
 
 
 class OnRun(ReportsErrors):
-    """Disable the operator's button while no run is imported; its tooltip then says so. Base class of the operators on the active run."""
+    """Disable an operator's button, with the reason, while no run is imported."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -81,19 +81,19 @@ class OnRun(ReportsErrors):
 
 
 class OnRunFolder(ReportsErrors):
-    """Store the folder of a run from the scene's list. Base class of the operators on one listed run."""
+    """Store the folder of the listed run that an operator works on."""
 
     folder: StringProperty(name="Run Folder")
 
 
 def has_trainer(operator: type[bpy.types.Operator]) -> bool:
-    """Return True if a trainer is set up. If not, the tooltip of the operator's button says what to do."""
+    """Check whether a trainer is set up, and explain in the tooltip if not."""
     operator.poll_message_set("Set up the trainer in the add-on's preferences first")
     return set_up()
 
 
 def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path) -> None:
-    """Import a run folder, and report the number of splats. Warn the artist of problems, such as splats that were left out."""
+    """Import a run folder, and report the result and its problems to the artist."""
     from ..scene.import_run import import_run
 
     run = import_run(folder, context.scene)
@@ -180,7 +180,7 @@ class Crop(ReportsErrors, bpy.types.Operator):
 
 
 class _Deletes(ReportsErrors):
-    """Find the splats' object for an operator, after a switch to Object Mode. Base class of operators that delete or restore splats."""
+    """Find the splats' object for an operator, after a switch to Object Mode."""
 
     splats: StringProperty(name="Splats", description="The object")
 
@@ -214,7 +214,7 @@ class RestoreSplats(_Deletes, bpy.types.Operator):
 
 
 def show_materials(context: bpy.types.Context) -> None:
-    """Switch the 3D views that are in Solid or Wireframe mode to Material Preview, lit by the scene's world."""
+    """Switch 3D views from Solid or Wireframe to Material Preview, lit by the scene's world."""
     for area in context.screen.areas if context.screen else ():
         if area.type == "VIEW_3D":
             shading = area.spaces.active.shading
@@ -299,10 +299,7 @@ class MarkAsset(OnRun, bpy.types.Operator):
 
 
 class _Render(ReportsErrors, ExportHelper):
-    """Ask for a PNG file to render to. Base class of the operators that render.
-
-    They render in another Blender process, or in this one if it has no window. Their buttons are disabled while the scene has no camera.
-    """
+    """Ask for a PNG file to render to, and require a camera in the scene."""
 
     bl_options: ClassVar = {"REGISTER"}
     filename_ext = ".png"

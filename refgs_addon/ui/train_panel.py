@@ -189,7 +189,7 @@ class TrainPanel(Tab, bpy.types.Panel):
 
 
 def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job, width: int) -> None:
-    """Draw a job of the trainer: its progress, its results and its buttons. `width` is how many letters fit into a line."""
+    """Draw a job's progress, results and buttons, on lines of `width` letters."""
     head = box.row()
     icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE", "paused": "PAUSE"}.get(job.state, "SORTTIME")
     head.label(text=job.name, icon=icon)
@@ -248,7 +248,7 @@ def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job, wid
 
 
 def _draw_photos(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job, width: int) -> None:
-    """Draw how many photos or masks a job has made, and the path of their folder. `width` is how many letters fit into a line."""
+    """Draw how many photos or masks a job has made, and their folder's path."""
     if found := job.results.get("frames"):
         out = f"{found['blurred']} were blurred, {found['duplicates']} showed what the one before did"
         wrapped_text(box, f"{found['photos']} photos of {found['frames']} frames; {out}", width)
@@ -270,13 +270,13 @@ def draw_status(self, context: bpy.types.Context) -> None:
 
 
 def fraction(job: jobs.Job) -> float:
-    """Return how much of a job is done, 0..1. For a job with several stages, return how much of the present stage is done."""
+    """Return how much of a job, or of its present stage, is done, 0..1."""
     facts = job.progress
     return facts["done" if "stage" in facts else "iteration"] / max(facts["total"], 1) if facts else 0.0
 
 
 def status_words(job: jobs.Job) -> str:
-    """Describe the progress of a job in a few words, such as "paused" or "3:20 left"."""
+    """Describe the progress of a job, such as "paused" or "3:20 left"."""
     if job.state == "paused":
         return "paused"
     if "train" in job.results:
@@ -297,7 +297,7 @@ def status_words(job: jobs.Job) -> str:
 
 
 def count_words(done: int, total: int, failed: int) -> str:
-    """Describe how many runs of a batch are done, and how many have failed, such as "2 of 5 done, 1 failed"."""
+    """Describe the state of a batch, such as "2 of 5 done, 1 failed"."""
     return f"{done} of {total} done" + (f", {failed} failed" if failed else "")
 
 
@@ -314,11 +314,7 @@ def command_button(layout: bpy.types.UILayout, job: jobs.Job, command: str, *, t
 
 
 def _draw_run(box: bpy.types.UILayout, scene: bpy.types.Scene, folder: Path, width: int) -> None:
-    """Draw a run of the scene's list, and below it the decisions of its training that the artist has not confirmed yet.
-
-    A finished run has a button that imports it, and a stopped one a button that resumes it. For a run that another process trains, the
-    progress is drawn. `width` is how many letters fit into a line.
-    """
+    """Draw a run of the scene's list, its progress or button, and its open decisions."""
     state = jobs.run_state(folder)
     row = box.row(align=True)
     if state == "finished":
@@ -341,7 +337,7 @@ def _draw_run(box: bpy.types.UILayout, scene: bpy.types.Scene, folder: Path, wid
 
 
 def other_process_status(folder: Path) -> tuple[float, str]:
-    """Return the progress of a run that another process trains: the fraction that is done, 0..1, and a short description."""
+    """Return the progress, 0..1, and a description of a run that another process trains."""
     facts = jobs.run_progress(folder)
     if not facts:
         return (1.0, "Making the mesh") if (folder / "splats.ply").exists() else (0.0, "Starting")
