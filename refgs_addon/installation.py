@@ -275,6 +275,8 @@ def _unpack(uv: Path, home: Path) -> Path:
 
 def _uv_environment(home: Path) -> dict[str, str]:
     """Return the environment variables for uv; those that the user has set keep their values."""
+    # "auto" lets uv choose the build of torch for this machine's GPU. With some package mirrors torch must come from the package index:
+    # then the user sets UV_TORCH_BACKEND to "". Blender's Python or the system's would not do, because an update may replace it.
     set_here = {"UV_TORCH_BACKEND": "auto", "UV_PYTHON_INSTALL_DIR": str(home / "python")}
     if not os.environ.keys() & {
         "UV_PYTHON_PREFERENCE",
@@ -325,6 +327,7 @@ def _run_uv(program: Path, variables: dict[str, str], home: Path, *arguments: st
 
 def _report_download(home: Path, fetching: dict[str, str], ended: threading.Event) -> None:
     """Report the progress of the downloads in `fetching` every two seconds until `ended` is set."""
+    # uv prints nothing while it downloads torch, which takes minutes: the progress is the size of its cache.
     while not ended.wait(2):
         now = list(fetching.items())
         if now:

@@ -75,6 +75,8 @@ def values_material() -> bpy.types.Material:
 
 def _finish(material: bpy.types.Material, shader: bpy.types.NodeSocket) -> None:
     """Give a splat its Gaussian alpha, and connect its `shader` to the material's output."""
+    # In each of its samples, Eevee draws a quad with a probability equal to its alpha, and the nearest one drawn is visible. The mean over
+    # the samples equals alpha compositing of the quads, sorted by depth in each pixel.
     material.surface_render_method = "DITHERED"
     tree = material.node_tree
     gaussian = _attribute(tree, "gaussian", VECTOR)
@@ -103,5 +105,6 @@ def _normal(tree: bpy.types.NodeTree) -> tuple[bpy.types.NodeSocket, bpy.types.N
     viewer = add(tree, "ShaderNodeNewGeometry").outputs["Incoming"]
     front = math(tree, "GREATER_THAN", vector_math(tree, "DOT_PRODUCT", to_world(centre), viewer), 0.0)
     bent = vector_math(tree, "NORMALIZE", to_world(bent))
+    # Near silhouettes the normal can point away from the viewer, and a BSDF would be black: it is turned until it is perpendicular.
     away = math(tree, "MINIMUM", vector_math(tree, "DOT_PRODUCT", bent, viewer), 0.0)
     return vector_math(tree, "NORMALIZE", vector_math(tree, "SUBTRACT", bent, scaled(tree, viewer, away))), front

@@ -286,6 +286,7 @@ def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
 
 def _morton_order(position: np.ndarray, shift: float) -> np.ndarray:
     """Argsort points (N, 3) along a Morton curve shifted by a fraction of its cube."""
+    # Points close together can be far apart along one curve. Along a second one, with another shift, they are likely to be close.
     low = position.min(axis=0)
     cells = (position - low) / max((position - low).max(), 1e-30) / 2 + np.float32(shift)
     key = np.zeros(len(position), np.uint64)
