@@ -124,14 +124,14 @@ def choose_device(device: str, report: Report) -> str:
 
 
 def _less(settings: Settings) -> str:
-    """Return the advice to a user whose main memory is full: a text that names the settings to lower, with their present values."""
+    """Advise which settings to lower, with their present values, if main memory is full."""
     side, budget = settings.image.max_side, settings.surfels.budget
     parts = f"smaller photos (image.max_side, now {side}) or fewer surfels (surfels.budget, now {budget})"
     return f"close other programs and resume, or train into a new folder with {parts}"
 
 
 def _known(asked: Asked) -> _Known:
-    """Read the settings, and check the run folders: all that can be checked before torch is imported. Raises InputError."""
+    """Read the settings and check the run folders without importing torch, or raise InputError."""
     if asked.resume:
         facts, settings = read_run_facts(asked.out)
         return _Known(settings, facts.preset, asked.out, facts)
@@ -213,7 +213,7 @@ def _rounded(values: Iterable[float]) -> list[float]:
 def _trainer(
     asked: Asked, known: _Known, capture: "Capture", effective: Effective, plan: Plan, device: str, report: Report
 ) -> "Trainer":
-    """Make the trainer. If a run is resumed, load its last checkpoint. Otherwise, create the run folder."""
+    """Make the trainer: resumed from its last checkpoint, or in a new run folder."""
     from refgs.train.fit import fitting
     from refgs.train.hints import continue_with_hints
     from refgs.train.trainer import Trainer
@@ -239,7 +239,7 @@ def _trainer(
 
 
 def _save_with_hints(trainer: "Trainer", known: _Known) -> None:
-    """Save a first checkpoint, then the hints. A run with hints must have a checkpoint to resume from: it cannot start over."""
+    """Save a first checkpoint, which a run with hints must have, then the hints."""
     from refgs.formats.hints import FILE, write_hints
 
     out = trainer.state.folder
@@ -251,7 +251,7 @@ def _save_with_hints(trainer: "Trainer", known: _Known) -> None:
 
 @contextmanager
 def _removed_if_empty(out: Path) -> Iterator[None]:
-    """Remove the folder `out` after a `with` block if it did not exist before the block and is empty."""
+    """Remove the folder `out` after a `with` block that created it and left it empty."""
     new = not out.exists()
     try:
         yield
@@ -263,10 +263,7 @@ def _removed_if_empty(out: Path) -> Iterator[None]:
 
 @contextmanager
 def _no_photos_left(out: Path) -> Iterator[None]:
-    """Delete the cached reduced photos in the folder `out` if the `with` block raises.
-
-    The run has not been created yet at this point. So no training can be resumed that would need these photos.
-    """
+    """Delete the cached reduced photos in `out` if the `with` block raises."""
     try:
         yield
     except BaseException as error:
@@ -286,10 +283,7 @@ def _create_run(state: "State", preset: str, device: str) -> None:
 
 
 def _resumed(trainer: "Trainer") -> "Trainer":
-    """Load the last checkpoint of an interrupted training, and return the trainer. Without a checkpoint, it is ready to start over.
-
-    Raises InputError if the run has hints but no checkpoint: such a run cannot start over.
-    """
+    """Load the last checkpoint, if any; a run with hints but without one raises InputError."""
     from refgs.formats.hints import FILE
 
     trainer.resume()
@@ -306,11 +300,7 @@ def _resumed(trainer: "Trainer") -> "Trainer":
 
 
 def _finish(trainer: "Trainer") -> float | None:
-    """Write the results and metrics.json. Return the mean PSNR of the held-out views, None without such views.
-
-    splats.ply is written last, because a run that has it counts as finished. So a training that is killed here can be resumed, and this
-    function runs again.
-    """
+    """Write the results and metrics.json; return the mean held-out PSNR, None without held-out views."""
     from refgs.run import record_changes
     from refgs.train.keep.ambiguity import ambiguities
     from refgs.train.keep.asset import write_asset
@@ -341,7 +331,7 @@ def _finish(trainer: "Trainer") -> float | None:
 
 
 def _remove_photos(out: Path) -> None:
-    """Remove the reduced photos from a run folder. Drop all references to them before: Windows cannot remove a file that is mapped."""
+    """Remove the reduced photos from a run folder, after all references to them are dropped."""
     from refgs.capture import remove_cached
 
     remove_cached(out / PHOTOS)
@@ -366,10 +356,7 @@ def _most_memory() -> dict[str, int]:
 
 @contextmanager
 def _card_memory(what: str | None = None) -> Iterator[None]:
-    """Raise TryAgain if a `with` block runs out of GPU memory, or if the GPU fails.
-
-    `what` is the error message if memory runs out. If it is None, the message is that of `full_card`.
-    """
+    """Raise TryAgain if the GPU fails or its memory is full (with the message `what`)."""
     import torch
 
     from refgs.kernels.cuda import CardError
@@ -386,7 +373,7 @@ def _card_memory(what: str | None = None) -> Iterator[None]:
 
 @contextmanager
 def _logged(out: Path) -> Iterator[None]:
-    """Write the traceback of an unexpected error in a `with` block to log.txt. InputErrors are not logged."""
+    """Write the traceback of a `with` block's unexpected error (no InputError) to log.txt."""
     try:
         yield
     except InputError:

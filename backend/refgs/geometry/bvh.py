@@ -17,7 +17,7 @@ _Work = struct("Trace", "trace.cu")
 
 
 def _spread_bits(v: Tensor) -> Tensor:
-    """Insert two zero bits between neighbouring bits of integers below 2^10. A Morton code is made of three of these."""
+    """Insert two zero bits between neighbouring bits of integers below 2^10."""
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         v = (v | v << shift) & mask
     return v

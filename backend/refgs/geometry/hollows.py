@@ -40,12 +40,7 @@ def carve_hollows(alpha: np.ndarray, low: np.ndarray, voxel: np.ndarray, photos:
 
 
 def _empty(shape: Shape, maps: Sequence[DepthMap], least: float) -> np.ndarray:
-    """Find the empty cells of a shape by votes of depth maps. Returns bool (X, Y, Z). The cells are the voxels of `shape`.
-
-    A depth map votes for "empty" in cells in front of its surface, and for "full" in cells on its surface. A vote has the weight of the
-    map's depth there. Votes are smoothed over neighbouring cells. A cell is empty if at least `least` maps see through it, and if "empty"
-    gets more than the fraction FREE of the votes.
-    """
+    """Find a shape's empty voxels (X, Y, Z), which at least `least` maps see through."""
     cells = np.argwhere(shape.solid)
     points = shape.low + (cells + 0.5) * shape.voxel
     band = BAND * shape.ball[1]

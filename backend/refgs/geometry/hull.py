@@ -113,7 +113,7 @@ def visual_hull_points(
 
 
 def _as_bytes(alpha: np.ndarray) -> np.ndarray:
-    """Convert a mask of floats in 0..1 to uint8. A uint8 mask is not copied, because masks of many photos take gigabytes."""
+    """Convert a mask of floats in 0..1 to uint8; return uint8 masks without a copy."""
     alpha = np.asarray(alpha)
     return alpha if alpha.dtype == np.uint8 else np.rint(255 * alpha).astype(np.uint8)
 
@@ -166,11 +166,7 @@ def _sample_triangles(vertices: np.ndarray, faces: np.ndarray, count: int, rng: 
 
 
 def _choose_evenly(dense: np.ndarray, count: int) -> np.ndarray:
-    """Choose `count` evenly spaced points from a larger set of points, `dense`, by a few Lloyd iterations. Returns (count, 3).
-
-    Each iteration assigns every point to the nearest chosen point. This forms groups. The point nearest to a group's mean is then chosen
-    for the group.
-    """
+    """Choose `count` evenly spaced points (count, 3) from `dense` by Lloyd iterations."""
     chosen = dense[:: len(dense) // count][:count]
     for _ in range(5):
         cell = cKDTree(chosen).query(dense)[1]

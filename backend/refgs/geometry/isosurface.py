@@ -51,10 +51,7 @@ def _assign_to_chunks(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mesh_chunk(block: np.ndarray, signed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Mesh one chunk by marching cubes. Returns vertices and faces, or None if the chunk contains no surface.
-
-    The blocks' positions in `block` and the vertices are relative to the chunk's lower corner.
-    """
+    """Mesh one chunk, relative to its lower corner; None if it contains no surface."""
     side = _CHUNK + 1
     grid = np.full((side * BLOCK,) * 3, np.nan, np.float32)
     grid.reshape((side, BLOCK) * 3).transpose(0, 2, 4, 1, 3, 5)[tuple(block.T)] = signed.reshape(
@@ -78,10 +75,7 @@ def _mesh_chunk(block: np.ndarray, signed: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    """Merge the vertices that neighbouring chunks have in common.
-
-    Common vertices have equal coordinates, bit for bit, because both chunks interpolate them between the same two voxels.
-    """
+    """Merge the equal vertices that neighbouring chunks have in common."""
     shared = np.flatnonzero((vertices % (BLOCK * _CHUNK) == 0).any(axis=1))
     _, kept, which = np.unique(vertices[shared], axis=0, return_index=True, return_inverse=True)
     target = np.arange(len(vertices))

@@ -58,13 +58,13 @@ def clean(mesh: Mesh, triangles: int) -> SmoothMesh:
 
 
 def _large(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Mark the faces (F,) of all connected parts except crumbs, which have less than KEEP times the largest part's area."""
+    """Mark the faces (F,) of connected parts with at least KEEP times the largest area."""
     part, areas = parts(mesh)
     return (areas >= KEEP * areas.max())[part]
 
 
 def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Close holes of at most HOLE edges. Each is filled with a fan of triangles around the mean of the hole's vertices."""
+    """Close holes of at most HOLE edges with fans of triangles."""
     border = _border(mesh)
     if not len(border):
         return mesh
@@ -82,11 +82,7 @@ def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _untrimmed(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Mark the faces (F,) that belong neither to crumbs (small loose parts) nor to frays (narrow strips at a border). See `clean`.
-
-    This is a morphological opening of the surface. FRAY rings of faces are removed along the borders. The pieces that have become crumbs
-    are removed too. What remains grows back by FRAY rings. Surfaces fray where photos end, because few photos show what is there.
-    """
+    """Mark the faces (F,) that belong neither to crumbs nor to frays (see `clean`)."""
     border = np.zeros(len(mesh.vertices), bool)
     border[_border(mesh)] = True
     core = ~_grown(border, mesh.faces, FRAY - 1)[mesh.faces].any(axis=1)
@@ -99,7 +95,7 @@ def _untrimmed(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def _border(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Return the edges (B, 2) that belong to one face only: two vertex numbers each, in the order of the face's winding."""
+    """Return the edges (B, 2) of one face only, in the face's winding order."""
     _, edge, faces = np.unique(mesh.edges_sorted, axis=0, return_inverse=True, return_counts=True)
     return mesh.edges[faces[edge.reshape(-1)] == 1]
 
@@ -114,10 +110,7 @@ def _grown(marked: np.ndarray, faces: np.ndarray, rings: int) -> np.ndarray:
 
 
 def _manifold(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Mark the faces (F,) to keep so that no edge has more than two faces. At each edge, the two largest faces are kept.
-
-    Edges with three faces arise when simplification folds a thin part of the mesh.
-    """
+    """Mark the faces (F,) to keep so that no edge has more than two faces."""
     _, edge = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
     edge, face = edge.reshape(-1), mesh.edges_face
     order = np.lexsort((-mesh.area_faces[face], edge))
@@ -129,13 +122,13 @@ def _manifold(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def is_crumbs(mesh: Mesh, many: int = 5) -> bool:
-    """Tell whether a mesh is in pieces: it has more than `many` connected parts, and each part has less than half of the whole area."""
+    """Tell whether a mesh has over `many` parts, each under half of the area."""
     _, areas = parts(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
     return len(areas) > many and areas.max() < areas.sum() / 2
 
 
 def parts(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
-    """Find the connected parts of a mesh. Returns each face's part number (F,), and each part's area."""
+    """Return each face's connected part (F,), and each part's area."""
     part = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
     return part, np.bincount(part, mesh.area_faces)
 

@@ -61,9 +61,6 @@ def remap(
 
 
 def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Test which points are in front of the camera and inside its image. Returns bool (N,).
-
-    `pixels` and `depth` are results of `project`.
-    """
+    """Test which results of `project` are in front of the camera and inside its image."""
     x, y = pixels[:, 0], pixels[:, 1]
     return (depth > 0) & (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)

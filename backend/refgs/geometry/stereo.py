@@ -34,7 +34,7 @@ BISECTIONS = 3  # of the step between two planes
 
 
 class Photo(NamedTuple):
-    """Hold a photo: `image` (H, W, 3), its mask `alpha` (H, W) uint8, its camera, and `white`, the value of a white pixel in `image`."""
+    """Hold a photo's `image` (H, W, 3), uint8 mask `alpha`, camera and white value."""
 
     image: np.ndarray
     alpha: np.ndarray
@@ -61,7 +61,7 @@ class Shape:
         return (first + last) / 2, float(np.linalg.norm(last - first)) / 2
 
     def fit(self, camera: Camera, across: int) -> Camera:
-        """Return the camera for a reduced picture, in which the shape's ball is `across` pixels wide. Pictures are never enlarged."""
+        """Reduce the camera, never enlarging it, until the shape's ball is `across` pixels wide."""
         centre, radius = self.ball
         distance = float(np.linalg.norm(camera.position - centre))
         side = across * max(camera.width, camera.height) * distance / (2 * radius * camera.fx)
@@ -76,7 +76,7 @@ class Shape:
 
 
 class DepthMap(NamedTuple):
-    """Hold a view's `depth` (h, w), along the camera's axis, and its `weight` (h, w) in 0..1, which is 0 where depth is unknown."""
+    """Hold a view's `depth` (h, w), and its `weight` (0..1), 0 where it is unknown."""
 
     camera: Camera
     depth: np.ndarray
@@ -136,11 +136,7 @@ def _reduced(photo: Photo, shape: Shape) -> _Reduced:
 
 
 def _neighbours(cameras: list[Camera], centre: np.ndarray) -> list[np.ndarray]:
-    """Choose at most NEIGHBOURS neighbours for each camera. Returns an array of indices for each camera, the nearest neighbour first.
-
-    The distance of two cameras is the angle between them in degrees, seen from `centre`. It lies between ANGLES[0] and ANGLES[1] for
-    neighbours.
-    """
+    """Choose at most NEIGHBOURS neighbours for each camera, nearest in angle at `centre` first."""
     towards = np.stack([camera.position for camera in cameras]) - centre
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     angle = np.degrees(np.arccos((towards @ towards.T).clip(-1, 1)))
@@ -149,11 +145,7 @@ def _neighbours(cameras: list[Camera], centre: np.ndarray) -> list[np.ndarray]:
 
 
 def _sweep(photo: _Reduced, others: list[_Reduced], shape: Shape, unsure: np.ndarray) -> DepthMap:
-    """Find the depth of each pixel of a photo, by comparing the photo with `others` on planes at many depths.
-
-    A pixel gets the depth of the plane on which the photo looks most like `others`. A plane counts only if the pixel's ray meets it near or
-    in a solid voxel of `shape`. Pixels get no depth if their rays enter the shape outside of the voxels `unsure` (X, Y, Z), bool.
-    """
+    """Find depths where rays enter `unsure` voxels, by comparing the photo with `others` on planes."""
     camera, (centre, radius) = photo.camera, shape.ball
     middle = float(camera.world_to_camera[2, :3] @ centre + camera.world_to_camera[2, 3])
     planes = 1 / np.linspace(1 / max(middle - radius, radius / 100), 1 / (middle + radius), PLANES)
@@ -230,16 +222,12 @@ def _scores(
 
 
 def _intrinsics(camera: Camera) -> np.ndarray:
-    """Return the matrix (3, 3) that projects points in camera coordinates to pixels. As in OpenCV, the centre of a pixel is at integers."""
+    """Return the intrinsic matrix (3, 3) for OpenCV, whose pixel centres are at integers."""
     return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
 
 
 def _agreed(i: int, near: list[np.ndarray], maps: dict[int, DepthMap], tolerance: float) -> DepthMap:
-    """Return the depth map of photo `i`, with weight 0 for depths on which fewer than AGREE of its neighbours' maps agree.
-
-    `near[i]` has the indices of the photo's neighbours, and `maps` has the depth maps by index. Two depths agree if they differ by less
-    than `tolerance`, in world units.
-    """
+    """Return depth map `i`, with weight 0 where fewer than AGREE neighbours agree within `tolerance`."""
     camera, depth, weight = maps[i]
     rows, columns = np.nonzero(weight)
     points = camera.position + pixel_rays(camera, rows, columns) * depth[rows, columns, None]

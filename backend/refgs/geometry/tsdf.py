@@ -64,7 +64,7 @@ def fuse(
 
 
 def _with_neighbours(block: Tensor, blocks: int) -> Tensor:
-    """Add to blocks (M, 3) all their neighbours in a grid of `blocks`³ blocks. The result is sorted and has no duplicates."""
+    """Add all neighbours in a `blocks`³ grid to blocks (M, 3), sorted without duplicates."""
     step = torch.arange(-1, 2, device=block.device)
     around = (_unique(block, blocks)[:, None] + torch.cartesian_prod(step, step, step)).view(-1, 3)
     return _unique(around[((around >= 0) & (around < blocks)).all(dim=-1)], blocks)
@@ -81,7 +81,7 @@ def _tensor_like(like: Tensor, numbers: np.ndarray) -> Tensor:
 
 
 def _rays(camera: Camera, like: Tensor) -> Tensor:
-    """Compute a ray (H, W, 3) through each pixel's centre, in camera coordinates with z = 1. `like` is a depth map (H, W)."""
+    """Compute pixel centres' rays (H, W, 3) in camera coordinates with z = 1."""
     x = (torch.arange(camera.width, device=like.device) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, device=like.device) + 0.5 - camera.cy) / camera.fy
     return torch.stack([x.expand_as(like), y[:, None].expand_as(like), torch.ones_like(like)], dim=-1)
@@ -94,10 +94,7 @@ def _solid(depth: Tensor, alpha: Tensor) -> Tensor:
 def _blocks_of_pixels(
     depth: Tensor, alpha: Tensor, camera: Camera, low: np.ndarray, side: float, blocks: int
 ) -> Tensor:
-    """Find the blocks (M, 3) of voxels in which the surface points of a depth map lie. They are sorted, without duplicates.
-
-    The grid starts at the corner `low` and has `blocks`³ blocks with the side `side`, in world units.
-    """
+    """Find the blocks (M, 3) that contain a depth map's surface, sorted without duplicates."""
     camera, solid = camera.resized(*depth.shape[::-1]), _solid(depth, alpha)
     local = _rays(camera, depth)[solid] * depth[solid][:, None]
     to_block = _tensor_like(depth, camera.world_to_camera[:3, :3] / side)
@@ -106,7 +103,7 @@ def _blocks_of_pixels(
 
 
 class _View:
-    """Compute signed distances from voxels to the surface in one depth map, and the weights of these distances."""
+    """Compute voxels' signed distances to the surface in one depth map, and their weights."""
 
     def __init__(self, depth: Tensor, alpha: Tensor, camera: Camera, low: np.ndarray, voxel: float):
         self.camera = camera = camera.resized(*depth.shape[::-1])
@@ -170,10 +167,7 @@ class _View:
         total += vote * torch.where(carve, 1, signed.clamp_max(1))
 
     def _project(self, block: Tensor) -> Tensor:
-        """Project the voxels of blocks (M, 3) into the depth map. Returns (3, M, BLOCK³).
-
-        The three rows are x · depth, y · depth and depth, with the position (x, y) in pixels.
-        """
+        """Project the blocks' voxels to homogeneous pixel positions (3, M, BLOCK³), with depth last."""
         index = torch.arange(_BLOCK, device=block.device, dtype=torch.float32)
         offset = torch.cartesian_prod(index, index, index) @ self.step.T
         corner = (_BLOCK * block).float() @ self.step.T + self.first

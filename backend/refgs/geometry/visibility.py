@@ -32,10 +32,7 @@ class Occluder:
         TriangleMesh(self._scene, ((corners - self._centre) / self._size).astype(np.float32))
 
     def tree(self, device: torch.device) -> Tree:
-        """Return the mesh's bounding volume hierarchy, for tracing rays on a CUDA card. The first call builds it.
-
-        On the CPU, Embree traces the rays instead.
-        """
+        """Return the mesh's bounding volume hierarchy for CUDA, built at the first call."""
         if self._tree is None:
             self._tree = Tree(self.mesh, self._centre, self._size, self.lift / self._size, device)
         return self._tree

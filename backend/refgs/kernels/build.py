@@ -32,7 +32,7 @@ FLAGS += ["-fno-builtin", "-ffp-contract=on", "-fno-math-errno", "-mprefer-vecto
 
 @dataclass(frozen=True)
 class Target:
-    """Describe what a library is compiled for. Platform and processor are names of Zig; `extension` is the library's file extension."""
+    """Describe what a library is compiled for: Zig's platform and processor, and a file extension."""
 
     platform: str
     processor: str
@@ -63,7 +63,7 @@ def target(system: str, machine: str, isa: str) -> Target:
 
 
 def cache_folder() -> Path:
-    """Return the folder for compiled kernels: the environment variable REFGS_CACHE, or else a folder in the user's cache."""
+    """Return the folder for compiled kernels: REFGS_CACHE, or one in the user's cache."""
     return Path(os.environ.get("REFGS_CACHE") or platformdirs.user_cache_dir("refgs", appauthor=False))
 
 
@@ -85,7 +85,7 @@ def sizes() -> dict[str, int]:
 
 
 def unwritable(cache: Path, error: OSError) -> InputError:
-    """Return an InputError that says why the folder `cache` cannot be written, and what to do."""
+    """Return an InputError that says why `cache` cannot be written, and what to do."""
     return InputError(
         f"cannot write compiled kernels to {cache}: {error.strerror}; set REFGS_CACHE to a folder that can be written"
     )
@@ -111,11 +111,7 @@ def build(target: Target, cache: Path) -> Path:
 
 @contextmanager
 def _sole_build(cache: Path) -> Iterator[None]:
-    """Lock `cache` during the `with` block, so that no other process builds in it. Remove what killed builds have left there.
-
-    Waits while another process has the lock. On a file system without locks, this does nothing. Raises OSError if the lock cannot be
-    opened, for example because `cache` cannot be written.
-    """
+    """Lock `cache` for one build, and remove remains of killed ones; may raise OSError."""
     file = cache / "build.lock"
     lock = FileLock(file)
     try:
@@ -136,7 +132,7 @@ def _sole_build(cache: Path) -> Iterator[None]:
 
 
 def _compile(target: Target, library: Path) -> None:
-    """Compile the kernels in a temporary folder beside the file `library`, then move the result to `library`."""
+    """Compile the kernels beside the file `library`, then move the result there."""
     with tempfile.TemporaryDirectory(prefix="build-", dir=library.parent, ignore_cleanup_errors=True) as scratch:
         made = Path(scratch) / library.name
         command = [sys.executable, "-P", "-m", "ziglang", "c++", *FLAGS]

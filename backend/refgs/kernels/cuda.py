@@ -38,10 +38,7 @@ NO_CARD = "no NVIDIA card, or no driver for it, was found"
 
 
 def unusable() -> str | None:
-    """Return None if a CUDA card can be used. Otherwise return one line that says why not.
-
-    Without a card or a driver, the line is NO_CARD.
-    """
+    """Return why no CUDA card can be used (NO_CARD if there is none), or None."""
     if torch.version.cuda is None:
         return NO_CARD
     with warnings.catch_warnings(record=True) as said:  # torch warns if the driver is too old
@@ -61,11 +58,11 @@ def unusable() -> str | None:
 
 
 class CardError(RuntimeError):
-    """Report that a CUDA card can no longer be used: it was lost, or a kernel failed on it."""
+    """Report that a CUDA card was lost, or that a kernel failed on it."""
 
 
 def _check(result: tuple, what: str) -> Any:
-    """Raise an error if a CUDA call failed; the message begins with `what`. Return the call's results without the status."""
+    """Return a CUDA call's results without its status, or raise an error about `what`."""
     status, *values = result
     if status.name == "CUDA_ERROR_OUT_OF_MEMORY":
         raise torch.OutOfMemoryError(what)
@@ -76,7 +73,7 @@ def _check(result: tuple, what: str) -> Any:
 
 
 def compile_source(source: str, architecture: str) -> bytes:
-    """Compile a kernel source file to machine code (cubin) for an architecture such as "sm_86". No card is needed."""
+    """Compile a kernel source file to machine code (cubin) for an architecture such as "sm_86"."""
     import cuda.bindings.nvrtc as nvrtc
 
     headers = [(HERE / name).read_bytes() for name in HEADERS]
@@ -118,7 +115,7 @@ def cubin(source: str, architecture: str, cache: Path) -> bytes:
 
 @functools.cache
 def _module(source: str, device: int):
-    """Load all kernels of a source file on a card, in the CUDA context that torch uses."""
+    """Load all kernels of a source file on a card, in torch's CUDA context."""
     import cuda.bindings.driver as driver
 
     major, minor = torch.cuda.get_device_capability(device)

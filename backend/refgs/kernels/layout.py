@@ -22,13 +22,10 @@ NUMBERS = {
 
 
 class Work(ctypes.Structure):
-    """Hold the arguments of a kernel: numbers, and pointers to tensors. `struct` makes a subclass for each kernel."""
+    """Hold a kernel's arguments, numbers and pointers to tensors; `struct` makes subclasses."""
 
     def attach(self, **tensors: torch.Tensor) -> None:
-        """Set pointer fields, by name, to the memory of tensors.
-
-        The tensors must be contiguous. They must exist as long as kernels use the pointers.
-        """
+        """Set pointer fields, by name, to contiguous tensors that must outlive the kernels' use."""
         for name, tensor in tensors.items():
             assert tensor.is_contiguous()
             setattr(self, name, tensor.data_ptr())

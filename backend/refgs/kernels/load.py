@@ -36,11 +36,7 @@ def supported() -> list[str]:
 
 
 def _keep_memory() -> None:
-    """Tell GNU's malloc to keep freed memory in the process.
-
-    By default, freed buffers go back to the system at the end of each iteration. The next iteration then gets new pages, and a page fault
-    for each. This takes 4 % of an iteration's time for small pictures, and half for large ones.
-    """
+    """Tell GNU's malloc to keep freed memory, which saves page faults in each iteration."""
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
         libc.mallopt(-4, 0)  # M_MMAP_MAX: no allocation has a mapping of its own, however large
         libc.mallopt(-8, 1)  # M_ARENA_MAX: threads reuse each other's freed memory
@@ -73,11 +69,7 @@ def kernels() -> ctypes.CDLL:
 
 @functools.cache
 def _openmp() -> Callable | None:
-    """Find the function GOMP_parallel of torch's OpenMP library. Return None if that library is not GNU's.
-
-    With this function, kernels run on torch's own threads. These keep spinning for a while after torch's work, so other threads would
-    compete with them for the cores.
-    """
+    """Find GOMP_parallel, which runs kernels on torch's own threads; None without GNU's OpenMP."""
     torch_folder = Path(torch.__file__).parent
     for path in (*torch_folder.glob("lib/libgomp*"), *torch_folder.parent.glob("torch.libs/libgomp*")):
         try:
@@ -96,7 +88,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def on_gpu(tensor: torch.Tensor) -> bool:
-    """Tell whether a tensor is on a CUDA card. Kernels that use the tensor then run there, too."""
+    """Tell whether a tensor is on a CUDA card, where kernels then run, too."""
     return tensor.device.type == "cuda"
 
 

@@ -16,7 +16,7 @@ SYMMETRIES = 24  # of the cube: all changes of the axes' signs, times all cyclic
 
 
 def _face_direction(face: Tensor, s: Tensor, t: Tensor) -> Tensor:
-    """Return the direction from the cube's centre to the point (s, t) on a face. It is not normalised."""
+    """Return the unnormalised direction from the cube's centre to (s, t) on a face."""
     face, s, t = torch.broadcast_tensors(face, s, t)
     axis, sign = face // 2, (1 - 2 * (face % 2)).to(s.dtype)
     direction = torch.stack([sign, s, t], dim=-1)  # along the face's axis and the two that follow it
@@ -44,7 +44,7 @@ def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 @lru_cache(maxsize=32)
 def texel_directions(resolution: int) -> Tensor:
-    """Return the unit directions to the centres of all texels of a cubemap with R = `resolution`: (6·R², 3), float64."""
+    """Return the unit directions to a cubemap's texel centres: (6·R², 3), float64."""
     centres = (torch.arange(resolution, dtype=torch.float64) + 0.5) * (2 / resolution) - 1
     face = torch.arange(6)[:, None, None]
     direction = _face_direction(face, centres[None, None, :], centres[None, :, None])
@@ -53,7 +53,7 @@ def texel_directions(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=32)
 def texel_solid_angles(resolution: int) -> Tensor:
-    """Return the exact solid angles in steradians of all texels of a cubemap with R = `resolution`: (6·R²,), float64. They sum to 4π."""
+    """Return a cubemap's exact texel solid angles in steradians: (6·R²,), float64."""
     edges = torch.arange(resolution + 1, dtype=torch.float64) * (2 / resolution) - 1
     s, t = edges[None, :], edges[:, None]
     corner = torch.atan2(s * t, torch.sqrt(s * s + t * t + 1))  # area of the rectangle from the face's centre to (s, t)
@@ -92,7 +92,7 @@ def orbit_order(sides: tuple[int, ...]) -> Tensor:
 
 
 def in_texel_order(levels: Tensor, sides: tuple[int, ...]) -> Tensor:
-    """Reorder stacked cubemaps (Σ 6·side², C) from orbit order (see `orbit_order`) to the order face, row, column, which `sample` reads."""
+    """Reorder stacked cubemaps (Σ 6·side², C) from orbit order to face, row, column."""
     return levels[orbit_order(sides).argsort()]
 
 
@@ -110,10 +110,7 @@ def compositions() -> Tensor:
 
 @lru_cache(maxsize=32)
 def _padded_texels(resolution: int) -> Tensor:
-    """Return a table (6, R + 2, R + 2) of texel indices: the faces, with a border one texel wide. R = `resolution`.
-
-    The border holds the neighbouring faces' texels, so that bilinear look-up has no seams.
-    """
+    """Return texel indices (6, R+2, R+2) of the faces, bordered by their neighbours' texels."""
     centres = (torch.arange(-1, resolution + 1, dtype=torch.float64) + 0.5) * (2 / resolution) - 1
     face = torch.arange(6)[:, None, None]
     inside = centres.clamp(-1, 1)
@@ -167,7 +164,7 @@ def _bilinear(face: Tensor, s: Tensor, t: Tensor, level: Tensor, sides: tuple[in
 
 
 def reduced(texels: Tensor, side: int) -> Tensor:
-    """Reduce a cubemap's texels (6·R², C) to `side` texels along a side (6·side², C), by averaging blocks of texels."""
+    """Average blocks of a cubemap's texels (6·R², C) to `side` texels along a side."""
     fine = math.isqrt(len(texels) // 6) // side
     return texels.reshape(6, side, fine, side, fine, -1).mean(dim=(2, 4)).reshape(6 * side * side, -1)
 

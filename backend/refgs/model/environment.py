@@ -13,7 +13,7 @@ from refgs.model import cubemap, harmonics, prefilter
 
 
 def turn_between(camera: Camera, reference: Camera) -> np.ndarray:
-    """Return the rotation (3, 3) about the world's z axis that turns the heading (compass direction) of `camera` to that of `reference`."""
+    """Return the rotation (3, 3) about world z from `camera`'s heading to `reference`'s."""
     angle = reference.heading - camera.heading
     sine, cosine = math.sin(angle), math.cos(angle)
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
@@ -40,11 +40,11 @@ class Environment:
         return (harmonics.basis(directions, 3) * area[:, None]).T.float().to(self.radiance.device) @ self.radiance
 
     def diffuse(self, normals: Tensor) -> Tensor:
-        """Return irradiance / π (P, 3) for unit normals (P, 3): the radiance of a white matte surface."""
+        """Return irradiance / π (P, 3) for unit normals (P, 3)."""
         return prefilter.irradiance(self.levels.cpu(), self.sides, normals.cpu()).to(normals)
 
     def turn(self, camera: Camera) -> np.ndarray:
-        """Return the rotation (3, 3) that takes a world direction to the direction in which `radiance` is looked up, for this camera."""
+        """Return the rotation (3, 3) from world directions to those in which `radiance` is stored."""
         return np.eye(3) if self.reference is None else turn_between(camera, self.reference)
 
     def reduced(self, side: int) -> "Environment":

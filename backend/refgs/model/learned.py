@@ -28,7 +28,7 @@ _Work = struct("Adam", "adam.cpp")
 
 @dataclass
 class Moments:
-    """Hold Adam's moments of a tensor after `steps` steps: the running means of its gradient (`mean`) and of the gradient's `square`."""
+    """Hold Adam's moments after `steps` steps: running means of the gradient and its `square`."""
 
     steps: int
     mean: Tensor
@@ -49,7 +49,7 @@ class Learned(Mapping[str, Tensor]):
     BETAS, EPSILON = (0.9, 0.999), 1e-15
 
     def __init__(self, radius: float = 1.0, brightest: float = math.inf) -> None:
-        """Start without tensors. `limits` uses the scene's `radius` (world units) and the highest raw value of light, `brightest`."""
+        """Start without tensors; `limits` uses `radius` (world units) and `brightest` (raw light)."""
         self.rates: dict[str, float] = {}
         self.moments: dict[str, Moments] = {}  # of the tensors that Adam has updated
         self.constant: dict[str, Tensor] = {}
@@ -77,10 +77,7 @@ class Learned(Mapping[str, Tensor]):
         return len(self._values["position"])
 
     def limits(self, name: str) -> tuple[float, float]:
-        """Return the lowest and the highest raw value, before activation, that elements of a tensor may take.
-
-        Beyond these limits, gradients would be too small to move the value back.
-        """
+        """Return the lowest and highest value, before activation, that a tensor's elements may take."""
         if name == "scale":
             return math.log(SMALLEST * self._radius), math.log(LARGEST * self._radius)
         if name == "environment":
@@ -101,10 +98,7 @@ class Learned(Mapping[str, Tensor]):
             self._by_row.add(name)
 
     def drop(self, *names: str) -> None:
-        """Stop learning the tensors `names`. Names that are not learned are ignored.
-
-        A tensor by row becomes constant: all surfels get the first surfel's value. Any other tensor is removed.
-        """
+        """Stop learning tensors: those by row keep the first surfel's value, others are removed."""
         for name in {*names} & {*self._values}:
             value = self._values.pop(name)
             self.moments.pop(name, None)
@@ -132,7 +126,7 @@ class Learned(Mapping[str, Tensor]):
         self.moments |= moments
 
     def columns(self, name: str, count: int) -> None:
-        """Keep only the first `count` columns of a tensor, such as spherical harmonic coefficients, and of its moments."""
+        """Keep only the first `count` columns of a tensor and of its moments."""
         self._values[name] = _leaf(self._values[name].detach()[:, :count].contiguous())
         if old := self.moments.get(name):
             mean, square = (moment[:, :count].contiguous() for moment in (old.mean, old.square))
@@ -140,19 +134,19 @@ class Learned(Mapping[str, Tensor]):
 
     @torch.no_grad()
     def fill(self, name: str, value: Tensor | float) -> None:
-        """Set a tensor to a number, or to a tensor that broadcasts to it. Forget its moments."""
+        """Set a tensor to a number or a broadcastable tensor, and forget its moments."""
         self._values[name][:] = value
         self.forget(name)
 
     def forget(self, name: str, which: Tensor | None = None) -> None:
-        """Set the moments of a tensor to zero in the rows where `which` (N,) is true. Without `which`, Adam starts anew with the tensor."""
+        """Zero a tensor's moments where `which` (N,) is true; None forgets them all."""
         if which is None:
             self.moments.pop(name, None)
         elif old := self.moments.get(name):
             old.mean[which] = old.square[which] = 0
 
     def has_learned(self, name: str) -> bool:
-        """Tell whether Adam has taken a step with a tensor since `learn` or `fill` set it."""
+        """Tell whether Adam has updated a tensor since `learn` or `fill` set it."""
         return name in self.moments
 
     def gradients(self) -> list[Tensor]:
@@ -195,7 +189,7 @@ class Learned(Mapping[str, Tensor]):
         run("refgs_adam_step", work, kept[0], items=sum(gradient.numel() for gradient in kept))
 
     def save(self) -> dict[str, Tensor]:
-        """Return all tensors and moments for a checkpoint, by the names under which `load` looks for them."""
+        """Return all tensors and moments by the names under which `load` expects them."""
         tensors = {self._kept(name): value for name, value in self._values.items()}
         tensors |= {f"constant.{name}": value for name, value in self.constant.items()}
         for name, moments in self.moments.items():
@@ -229,12 +223,12 @@ class Learned(Mapping[str, Tensor]):
             self.constant[name] = tensors[f"constant.{name}"] if learned is None else learned[:1]
 
     def _kept(self, name: str) -> str:
-        """Return the name that the tensor `name` has in a checkpoint: "parameter.NAME" for a tensor by row, otherwise its own name."""
+        """Return the tensor's name in a checkpoint: "parameter.NAME" for one by row, otherwise `name`."""
         return f"parameter.{name}" if name in self._by_row else name
 
 
 def belong_together(tensors: Mapping[str, Tensor]) -> bool:
-    """Tell whether the tensors of a checkpoint are complete, and whether their shapes and types match."""
+    """Tell whether a checkpoint's tensors are complete and match in shape and type."""
     fine = {"environment", "parameter.position"} <= tensors.keys()
     rows = tensors["parameter.position"].shape[:1] if fine else ()
     for name, value in tensors.items():
@@ -252,5 +246,5 @@ def belong_together(tensors: Mapping[str, Tensor]) -> bool:
 
 
 def _leaf(value: Tensor) -> Tensor:
-    """Return `value` as a leaf tensor of autograd, sharing its memory. It gets gradients if it holds floats."""
+    """Return `value` as a leaf of autograd that shares its memory."""
     return value.detach().requires_grad_(value.is_floating_point())

@@ -38,7 +38,7 @@ SAMPLES = 3  # sub-samples of the lobe along each side of a texel
 
 
 def level_sides(resolution: int) -> list[int]:
-    """Return the side of each prefiltered level in texels: one level for each of `ROUGHNESS`, and a last one for irradiance."""
+    """Return each prefiltered level's side in texels; the last level holds irradiance."""
     sides = [max(resolution // d, min(resolution, LEAST_SIDE)) for d in DIVISOR]
     return [*sides, min(resolution, IRRADIANCE_SIDE)]
 
@@ -59,7 +59,7 @@ def _pyramid_sides(resolution: int) -> list[int]:
 
 
 def ggx_lobe(cosine: np.ndarray, roughness: float) -> np.ndarray:
-    """Evaluate the GGX lobe K(θ) = D(cos(θ/2)) cos θ from cos θ, without its constant factor. Return 0 where cos θ is negative."""
+    """Evaluate the GGX lobe D(cos(θ/2)) cos θ, up to a constant factor, from cos θ."""
     a2 = roughness**4  # α² with α = roughness²
     half = (1 + cosine) / 2  # cos²(θ/2)
     return np.maximum(cosine, 0) / (half * (a2 - 1) + 1) ** 2
@@ -162,7 +162,7 @@ def _matrix_and_transpose(
 
 @lru_cache(maxsize=4)
 def matrices(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
-    """Return the sparse matrix that filters the pyramid (the cubemap and its mips) into all prefiltered levels, and its transpose."""
+    """Return the sparse matrix from the pyramid to all prefiltered levels, and its transpose."""
     itself = np.arange(resolution**2 // 4)  # level 0
     parts, start = [(itself, SYMMETRIES * itself, np.ones(len(itself)))], 6 * resolution**2
     for side, lobe in zip(level_sides(resolution)[1:], LOBES, strict=True):
@@ -179,10 +179,7 @@ def matrices(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
 
 @lru_cache(maxsize=4)
 def _pyramid(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
-    """Return the sparse matrix that averages a cubemap into its pyramid (the cubemap and its mips), and its transpose.
-
-    A texel of a mip is the mean of four finer texels, weighted by their solid angles.
-    """
+    """Return the sparse matrix from a cubemap to its pyramid of mips, and its transpose."""
     mip = sparse.identity(resolution**2 // 4, format="csr")
     mips = [mip]
     for side in _pyramid_sides(resolution)[:-1]:
@@ -207,10 +204,7 @@ _Work = struct("Product", "sparse.cpp")
 
 
 def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tensor:
-    """Multiply a `Matrix` by `dense` (columns, 3): the RGB of texels in orbit order (`cubemap.orbit_order`).
-
-    The product is in orbit order, too. If `rows` is given, row i of the product is stored as row `rows[i]` of the result.
-    """
+    """Multiply a `Matrix` by RGB in orbit order; with `rows`, store row i at `rows[i]`."""
     work = _Work(orbits=len(matrix.starts) - 1)
     out = dense.new_empty(SYMMETRIES * work.orbits, 3)
     work.attach(**matrix._asdict(), dense=dense, out=out, **({} if rows is None else {"rows": rows}))
@@ -246,9 +240,6 @@ def prefilter(radiance: Tensor, resolution: int) -> Tensor:
 
 
 def irradiance(levels: Tensor, sides: tuple[int, ...], normals: Tensor) -> Tensor:
-    """Look up irradiance / π (P, 3) for unit normals (P, 3) in the levels that `prefilter` returns.
-
-    The look-up runs on the CPU and is differentiable.
-    """
+    """Look up irradiance / π (P, 3) in `prefilter`'s levels, differentiably and on the CPU."""
     last = cubemap.in_texel_order(levels, sides)[-6 * sides[-1] ** 2 :]
     return cubemap.sample(last, sides[-1:], normals, torch.zeros(len(normals), dtype=normals.dtype))

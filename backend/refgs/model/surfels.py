@@ -26,7 +26,7 @@ logit; sh_dc (N, 1, 3); sh_rest (N, K − 1, 3); albedo (N, 3) logit; metallic (
 
 
 def axes(rotations: Tensor) -> list[Tensor]:
-    """Convert quaternions wxyz (N, 4) of any length to rotation matrices. Returns their three columns, (N, 3) each."""
+    """Convert quaternions wxyz of any length to rotation matrices' three columns, (N, 3) each."""
     w, x, y, z = torch.nn.functional.normalize(rotations, dim=-1).unbind(-1)
     return [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1),
@@ -63,14 +63,11 @@ class Surfels(NamedTuple):
     indirect_rest: Tensor
 
     def normals(self) -> Tensor:
-        """Return the unit normals (N, 3): the third column of each rotation matrix.
-
-        For 3D Gaussians, call `with_normals_last` first, so that the third axis is the normal.
-        """
+        """Return the unit normals (N, 3); 3D Gaussians first need `with_normals_last`."""
         return axes(self.rotations)[2]
 
     def without_directions(self) -> "Surfels":
-        """Drop all spherical harmonics of the colour except the constant, so that the colour no longer depends on the viewing direction."""
+        """Drop the colour's dependence on viewing direction: all harmonics except the constant."""
         return self._replace(sh_rest=self.sh_rest[:, :0])
 
     def chosen(self, which: Tensor) -> "Surfels":
@@ -146,7 +143,7 @@ def activate(p: Parameters) -> Surfels:
 
 
 def quaternions_towards(normals: np.ndarray) -> np.ndarray:
-    """Compute the unit quaternions wxyz (N, 4) of the shortest rotations from +z to unit normals (N, 3)."""
+    """Return the quaternions wxyz (N, 4) of the shortest rotations from +z to `normals`."""
     x, y, z = normals.T
     q = np.stack([1 + z, -y, x, np.zeros_like(z)], axis=1)
     q[1 + z < 1e-6] = (0, 1, 0, 0)  # straight down: a half turn about x
@@ -154,7 +151,7 @@ def quaternions_towards(normals: np.ndarray) -> np.ndarray:
 
 
 def raw_metallic(metallic: float) -> float:
-    """Return the raw parameter that the activation function turns into this metallic value, which lies between 0 and 1."""
+    """Return the raw parameter that activates to `metallic`, strictly between 0 and 1."""
     s = 0.5 - math.sin(math.asin(1 - 2 * metallic) / 3)  # 3 s² − 2 s³ = metallic
     return math.log(s / (1 - s))
 

@@ -118,5 +118,5 @@ def fitted(
 
 
 def _reduced(value: Tensor, factor: int) -> Tensor:
-    """Average a picture (H, W, C) over squares of `factor` pixels. Pixels beyond the last whole square are left out."""
+    """Average a picture (H, W, C) over whole squares of `factor` pixels."""
     return torch.nn.functional.avg_pool2d(value.permute(2, 0, 1), factor).permute(1, 2, 0)

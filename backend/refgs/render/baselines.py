@@ -136,12 +136,12 @@ def method_of(settings: RenderSettings) -> Method:
 
 
 def initial_stage(settings: RenderSettings) -> RenderSettings:
-    """Copy the settings, changed to shade each surfel before blending, as in the initial stage of the Ref-Gaussian paper (§3.3)."""
+    """Copy the settings, changed to shade surfels before blending (Ref-Gaussian paper, §3.3)."""
     return settings.model_copy(update={"shading": "splat"})
 
 
 def axes_of(settings: SurfelSettings) -> int:
-    """Return the number of scales of a splat: 3 for a 3D Gaussian, 2 for a surfel."""
+    """Return a splat's number of scales: 3 for a 3D Gaussian, 2 for a surfel."""
     return 3 if settings.primitive == "3dgs" else 2
 
 
@@ -155,10 +155,7 @@ def draw_colors(
     occluder: None = None,
     exposure: None = None,
 ) -> Rendering:
-    """Blend the surfels' own view-dependent colours, without materials or light.
-
-    Takes the arguments of `render`, but ignores `environment`, `settings`, `occluder` and `exposure`. Colours are sRGB-encoded.
-    """
+    """Blend the surfels' own view-dependent, sRGB-encoded colours, without materials or light."""
     normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)
     colors = directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera)
     features, depth, alpha = rasterize(*discs(surfels, camera), stack([normals, colors]), camera, near=near)
@@ -178,10 +175,7 @@ def draw_shaded_surfels(
     occluder: None = None,
     exposure: Tensor | None = None,
 ) -> Rendering:
-    """Shade each surfel, then blend the shaded surfels (Ref-Gaussian paper, §3.3).
-
-    Takes the arguments of `render`, but ignores `occluder`: reflections of the object in itself are not traced.
-    """
+    """Shade each surfel, then blend the results, without tracing reflections (Ref-Gaussian paper, §3.3)."""
     method, matte = method_of(settings), settings.reflection == "none"
     lit = channels(surfels, camera, settings, indirect=False)
     blended = [lit[0], shade_splats(stack(lit), environment, camera, method.mirror), *lit[1 : 2 if matte else 4]]

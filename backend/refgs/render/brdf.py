@@ -20,7 +20,7 @@ LEAST_N_V = 1e-4  # as in light.h
 
 
 def fresnel(cosine: np.ndarray) -> np.ndarray:
-    """Compute the Fresnel reflectance of a dielectric for unpolarised light, from the cosine between light and normal."""
+    """Compute a dielectric's unpolarised Fresnel reflectance from the cosine between light and normal."""
     inside = np.sqrt(IOR**2 - 1 + cosine**2)  # IOR times the refracted ray's cosine
     across, along = (IOR**2 * cosine - inside) / (IOR**2 * cosine + inside), (cosine - inside) / (cosine + inside)
     return (across**2 + along**2) / 2
@@ -37,10 +37,7 @@ def bounces(average_fresnel, energy, average_energy):
 
 
 def _gauss(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points and weights of a quadrature rule over 0..1.
-
-    The points are dense at both ends, where the integrands can behave like a square root.
-    """
+    """Return the points and weights of a quadrature rule over 0..1, dense at both ends."""
     x, weight = np.polynomial.legendre.leggauss(nodes)
     angle = np.pi / 4 * (x + 1)
     return np.sin(angle) ** 2, weight * np.pi / 4 * np.sin(2 * angle)
@@ -108,7 +105,7 @@ def reflectance_table(size: int = 64, nodes: int = 16) -> Tensor:
 
 
 def look_up(n_v: Tensor, roughness: Tensor) -> Tensor:
-    """Interpolate `reflectance_table` at cosines N·V (P,) and roughnesses (P,). Returns (P, 4), differentiable, in the type of `n_v`."""
+    """Interpolate `reflectance_table` differentiably at cosines N·V (P,) and roughnesses (P,), giving (P, 4)."""
     values, at = reflectance_table().to(n_v.dtype), torch.stack([n_v, roughness], dim=-1)
     places = at.clamp(LEAST_N_V, 1).sqrt() * (len(values) - 1)
     low = places.detach().floor().clamp_max(len(values) - 2)

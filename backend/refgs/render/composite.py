@@ -68,17 +68,13 @@ def blended_normals(splats: Splats) -> np.ndarray:
 
 
 def _outward(splats: Splats) -> np.ndarray:
-    """Return the unit normals (N, 3) of the splats' planes. Each points to the same side of its plane as the normal in `splats.normals`."""
+    """Return the unit normals (N, 3) of the splats' planes, towards the side of `splats.normals`."""
     plane = axes(torch.from_numpy(splats.rotations))[2].numpy()
     return np.where((plane * splats.normals).sum(axis=1, keepdims=True) < 0, -plane, plane)
 
 
 def _geometry(splats: Splats) -> Tensor:
-    """Collect the geometry of N splats in a table (N, 17).
-
-    The columns are the position, the two axes divided by their standard deviations, the normal of the splat's plane, the outward normal,
-    the opacity, and the mean standard deviation.
-    """
+    """Collect the splats' positions, scaled axes, normals, opacities and sizes in a table (N, 17)."""
     u, v, normal = (axis.numpy() for axis in axes(torch.from_numpy(splats.rotations)))
     scales = np.maximum(splats.scales[:, :2], 1e-12)
     columns = [splats.positions, u / scales[:, :1], v / scales[:, 1:], normal, _outward(splats)]

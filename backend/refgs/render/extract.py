@@ -49,10 +49,7 @@ def extract(
 def _foreground(
     points: np.ndarray, cameras: Sequence[Camera], centre: np.ndarray, radius: float
 ) -> tuple[np.ndarray, float]:
-    """Find the foreground as `extract` defines it: a mask (N,) of `points` (N, 3), and half the side of a cube about `centre`.
-
-    The cube contains 99 % of the points in the mask, and also the ball of `radius` about `centre`.
-    """
+    """Mark the foreground points (N,), and find half the side of their cube about `centre`."""
     distance = np.linalg.norm(points - centre, axis=1)
     shows = np.mean([inside(camera, *project(camera, points)) for camera in cameras], axis=0)
     shown = (distance < radius) | ((distance < REACH * radius) & (shows >= SHOWN))

@@ -49,6 +49,6 @@ def facing_normals(rotations: Tensor, positions: Tensor, camera: Camera) -> Tens
 
 
 def facing_cosine(positions: Tensor, normals: Tensor, camera: Camera) -> Tensor:
-    """Compute the cosine (N,) between each surfel's unit normal and its direction to the camera. `positions` and `normals` are (N, 3)."""
+    """Compute the cosine (N,) between each surfel's unit normal and its direction to the camera."""
     towards = torch.from_numpy(camera.position).to(positions) - positions
     return (torch.nn.functional.normalize(towards, dim=-1) * normals).sum(dim=-1)

@@ -45,7 +45,7 @@ def mirrored_light(
 
 
 def _texels_at(directions: Tensor) -> Tensor:
-    """Return the indices of the texels that lie in the directions (P, 3), on a coarse cubemap with SIDE texels along a side."""
+    """Return texel indices of directions (P, 3) on a cubemap with SIDE texels a side."""
     face, s, t = cubemap.face_coordinates(directions)
     column, row = (((x + 1) / 2 * SIDE).long().clamp(0, SIDE - 1) for x in (s, t))
     return (face * SIDE + row) * SIDE + column

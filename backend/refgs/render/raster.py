@@ -26,6 +26,6 @@ class Scene:
         self.upper, self.lower = upper, lower
 
     def keep(self, **tensors: Tensor) -> None:
-        """Set fields of the C struct, by name, to the memory of tensors. Keep the tensors in `kept`, so that this memory is not freed."""
+        """Point fields of the C struct to tensors, and keep these alive in `kept`."""
         self.attach(**tensors)
         self.kept = getattr(self, "kept", {}) | tensors

@@ -13,7 +13,7 @@ OCTAGON = ctypes.sizeof(struct("Octagon", "raster.h"))
 
 
 class Raster(struct("Raster", "raster.h"), Scene):
-    """Hold the arguments of the CPU rasteriser's kernels, and run these kernels. `Scene` says in which order to call the methods."""
+    """Hold the arguments of the CPU rasteriser's kernels, and run these (see `Scene`)."""
 
     def project(self, device: torch.device) -> None:
         library, n = kernels(), self.splats

@@ -25,7 +25,7 @@ def how_many(ends: torch.Tensor) -> int:
 
 
 class Raster(struct("Raster", "raster.cu"), Scene):
-    """Hold the arguments of the CUDA rasteriser's kernels, and run these kernels. `Scene` says in which order to call the methods."""
+    """Hold the arguments of the CUDA rasteriser's kernels, and run these (see `Scene`)."""
 
     def project(self, device: torch.device) -> None:
         def integers(*shape: int) -> torch.Tensor:

@@ -32,11 +32,7 @@ class Raster(NamedTuple):
 
 
 def _draw(splats: dict[str, Tensor], camera: Camera, near: float, *trim: float) -> tuple[Scene, Raster]:
-    """Rasterise a dict of tensors, named as the arguments of `rasterize`.
-
-    Returns two objects: the kernels' arguments, which the backward pass needs, and the maps. `trim` is empty, or holds `upper` and `lower`
-    as in `trimmed_depth`.
-    """
+    """Rasterise tensors named as `rasterize`'s arguments; return the kernels' arguments and the maps."""
     features = splats["features"]
     rasteriser = raster_cuda if load.on_gpu(features) else raster_cpu
     work = rasteriser.Raster(splats=features.shape[0], channels=features.shape[1])

@@ -19,7 +19,7 @@ COVERED, SHIFT_LIMIT, SHIFT_ALPHA = 1 / 255, 8.0, 0.3  # as in pixels.h
 
 
 def rotation_matrices(q: Tensor) -> Tensor:
-    """Convert quaternions wxyz (N, 4) of any length to matrices (N, 3, 3). A quaternion of length 0 gives the identity."""
+    """Convert quaternions wxyz of any length to matrices (N, 3, 3), zero to the identity."""
     norm = q.norm(dim=-1, keepdim=True)
     unit = torch.tensor([1.0, 0, 0, 0], dtype=q.dtype)
     w, x, y, z = torch.where(norm < 1e-12, unit, q / norm.clamp_min(1e-12)).unbind(-1)
@@ -156,7 +156,7 @@ def shade_splats(
     camera: Camera,
     turn: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Shade float64 surfels as `refgs.render.shade.shade_splats` does. Returns radiance (N, 3) and margins (N,), as defined in `shade`."""
+    """Shade float64 surfels like `refgs.render.shade.shade_splats`, giving radiance (N, 3) and the margins (N,) of `shade`."""
     towards, margins, matte = unit(torch.from_numpy(camera.position) - features[:, -3:]), [], features.shape[-1] == 6
     features = _with_matte_material(features) if matte else features
     appearance = features[:, 8:11] if features.shape[-1] > 11 else None
@@ -220,7 +220,7 @@ def radiance_towards(
 
 
 def _with_matte_material(maps: Tensor) -> Tensor:
-    """Extend normals and albedos (P, 6) by the material of a matte surface: metallic 0, roughness 1. Returns (P, 8)."""
+    """Extend normals and albedos (P, 6) by metallic 0 and roughness 1 to (P, 8)."""
     return torch.cat([maps, maps.new_tensor([0.0, 1.0]).expand(len(maps), 2)], dim=1)
 
 

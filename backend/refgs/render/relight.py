@@ -40,7 +40,7 @@ Progress = Callable[[int, int], None]
 
 
 def sphere(count: int) -> np.ndarray:
-    """Sample `count` unit directions (count, 3) that are spread evenly over the sphere: a Fibonacci lattice (Swinbank and Purser 2006)."""
+    """Spread `count` unit directions (count, 3) evenly over the sphere (Swinbank and Purser 2006)."""
     z = 1 - (2 * np.arange(count) + 1) / count
     azimuth = np.pi * (3 - math.sqrt(5)) * np.arange(count)
     across = np.sqrt(1 - z * z)
@@ -57,21 +57,14 @@ def mirror(directions, normals):
 
 
 def _split_sum(albedo: Tensor, metallic: Tensor, roughness: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the specular reflectance (P, 3) and the diffuse reflectance (P, 3) of materials.
-
-    Multiply the first by prefiltered radiance from the mirror direction, the second by irradiance / π. `cosine` (P,) is the cosine of the
-    angle between normal and viewing direction.
-    """
+    """Return the reflectances (P, 3) of prefiltered mirrored radiance, and of irradiance / π."""
     metal, dielectric = reflectance(cosine, roughness, albedo)
     metallic = metallic[:, None]
     return metallic * metal + (1 - metallic) * dielectric, (1 - metallic) * (1 - dielectric) * albedo
 
 
 def _prefiltered(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor) -> Tensor:
-    """Look up prefiltered light (P, 3) in unit directions (P, 3) for roughnesses (P,).
-
-    `levels` are stacked cubemaps with texels in the order face, row, column.
-    """
+    """Look up prefiltered light (P, 3) from `levels`, with texels in face, row, column order."""
     return cubemap.sample(levels, sides, directions, torch.from_numpy(prefilter.level_of(roughness.numpy())).float())
 
 
@@ -197,10 +190,7 @@ def received(surfels: Surfels, occluder: Occluder, light: Environment) -> Tensor
 
 
 def _gather(transport: Transport, light: Environment, bounces: int) -> tuple[Tensor, Tensor]:
-    """Compute the light that reaches each surfel, with `bounces` reflections between parts of the object.
-
-    Returns irradiance / π (N, 3), and spherical harmonics (N, 16, 3) of the radiance that comes from the object itself.
-    """
+    """Compute irradiance / π (N, 3), and harmonics (N, 16, 3) of the object's radiance."""
     past = _past_the_object(transport, light)
     levels = cubemap.in_texel_order(light.levels, light.sides)
     firsts = [_first(transport, rays, levels, light.sides) for _, rays, _ in transport.chunks()]
@@ -257,7 +247,7 @@ def _first(transport: Transport, rays: slice, levels: Tensor, sides: tuple[int, 
 
 
 def _past_the_object(transport: Transport, light: Environment) -> Tensor:
-    """Compute irradiance / π (N, 3) of the surfels from the environment alone, with the object's shadows."""
+    """Compute the surfels' irradiance / π (N, 3) from the environment, shadowed by the object."""
     texels, area = cubemap.texel_directions(light.resolution), cubemap.texel_solid_angles(light.resolution)
     cell = torch.from_numpy(cKDTree(transport.directions.numpy()).query(texels.numpy())[1])
     power = torch.zeros(len(transport.directions), 3).index_add_(0, cell, light.radiance * area[:, None].float())

@@ -26,7 +26,7 @@ SIGNED = 1.0  # added to the residual while it is blended: it may be negative, a
 
 
 def near_plane(radius: float) -> float:
-    """Return the smallest depth that is drawn in a scene of this radius. Both are in world units."""
+    """Return the smallest drawn depth, in world units, in a scene of this radius."""
     return NEAR * radius
 
 
@@ -36,7 +36,7 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 @timed("visibility")
 def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, occluder: Occluder) -> Tensor:
-    """Trace a ray from the surface in the mirror direction of each pixel. Returns (H, W): 0 where the object blocks it, else 1."""
+    """Return 0 (H, W) where the object blocks a pixel's mirror ray, else 1."""
     directions = mirror_directions(features, alpha, camera)
     if load.on_gpu(alpha):
         return occluder.tree(alpha.device).visible(directions, alpha, depth, camera)

@@ -40,7 +40,7 @@ class Rendering:
 
     @property
     def radiance(self) -> Tensor:
-        """Compute the linear radiance (H, W, 3) of each pixel from its colour, without background and exposure. Zero where nothing is."""
+        """Compute pixels' linear radiance (H, W, 3) without background and exposure, 0 where empty."""
         alpha = self.alpha[..., None]
         mean = (self.color - (1 - alpha) * self.background) / alpha.clamp_min(COVERED)
         radiance = srgb_decode(mean.clamp_min(0)) * (alpha > COVERED)

@@ -24,10 +24,7 @@ class ScreenGradient:
     @timed("densification")
     @torch.no_grad()
     def add(self, position: Tensor, gradient: Tensor, camera: Camera, accepted: Tensor | None = None) -> None:
-        """Add one view's gradient (N, 3) of the loss with respect to the world `position` (N, 3).
-
-        If `accepted`, a float32 scalar, is zero, nothing is added.
-        """
+        """Add one view's gradient of the loss by position, unless the scalar `accepted` is 0."""
         surfels = len(self.total)
         check(total=(self.total, (surfels,)), position=(position, (surfels, 3)), gradient=(gradient, (surfels, 3)))
         position, gradient, work = position.contiguous(), gradient.contiguous(), _Work(count=len(position))
@@ -38,5 +35,5 @@ class ScreenGradient:
         run("refgs_motion", work, position, items=work.count)
 
     def mean(self) -> Tensor:
-        """Return the length of each surfel's screen gradient (N,), averaged over the views that saw the surfel; zero if none did."""
+        """Return the mean length (N,) of surfels' screen gradients, 0 where no view saw them."""
         return self.total / self.views.clamp_min(1)

@@ -38,10 +38,7 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def shortest_last(rotations: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
-    """Reorder the axes of 3D Gaussians so that the shortest axis, which is the normal, comes third.
-
-    Returns the new `rotations`, quaternions wxyz (N, 4), and `scales` (N, 3).
-    """
+    """Reorder 3D Gaussians' axes so that the shortest, which is the normal, comes third."""
     shortest = scales.argmin(dim=1)
     turns = rotations.new_tensor(TO_THIRD)[shortest]
     order = (shortest[:, None] + torch.arange(1, 4, device=scales.device)) % 3
@@ -49,7 +46,7 @@ def shortest_last(rotations: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def with_normals_last(surfels: Surfels) -> Surfels:
-    """Reorder the axes of 3D Gaussians so that the normal is the third axis. Surfels have it there already, and are returned unchanged."""
+    """Make 3D Gaussians' normals the third axis; return surfels unchanged."""
     if surfels.scales.shape[1] == 2:
         return surfels
     rotations, scales = shortest_last(surfels.rotations, surfels.scales)
@@ -58,10 +55,7 @@ def with_normals_last(surfels: Surfels) -> Surfels:
 
 @timed("surfels")
 class _HalfAngle(Function):
-    """Compute atan2(y, x) / 2, with a derivative that fades to zero near the origin, where the angle is undefined.
-
-    A point is near the origin if x and y are tiny compared with `size`.
-    """
+    """Compute atan2(y, x) / 2, with a derivative that fades to 0 near the origin."""
 
     @staticmethod
     def forward(ctx, y, x, size):
@@ -77,10 +71,7 @@ class _HalfAngle(Function):
 
 
 def discs(surfels: Surfels, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return positions, rotations, scales and opacities, the first four arguments of `rasterize`.
-
-    3D Gaussians are replaced by flat discs that look the same to this camera.
-    """
+    """Return `rasterize`'s first four arguments, with 3D Gaussians as discs that look the same."""
     positions, rotations, scales, opacities, *_ = surfels
     if scales.shape[1] == 3:
         rotations, scales = across_the_axis(positions, rotations, scales, camera)

@@ -98,12 +98,7 @@ def between(quick: Settings, standard: Settings, part: float) -> Settings:
 
 
 def _scheduled(settings: Settings, iterations: float, quick: Settings, standard: Settings) -> Settings:
-    """Set the number of iterations, and adapt the schedule and the learning rates to it.
-
-    The learning rates stay as they are if the number of iterations lies between those of `quick` and `standard`. Otherwise they are
-    multiplied by √(n / iterations), where n is the nearer of these two numbers. The factor is at most FASTEST. It keeps the noise of all
-    steps together about the same. (Each step adds noise, because it uses only one view.)
-    """
+    """Set the number of iterations, and adapt the schedule and the learning rates to it."""
     tables, part = settings.model_dump(), iterations / settings.train.iterations
     usual = min(max(iterations, quick.train.iterations), standard.train.iterations)
     for section, name in (("train", "iterations"), *SCHEDULE):

@@ -66,11 +66,7 @@ def hinted_kinds(state: State, splats: np.ndarray, hints: list[Hint]) -> torch.T
 
 
 def _go_back(state: State) -> None:
-    """Set the iteration to the fraction AGAIN of the total, and set the training's times to zero.
-
-    Without a time limit, AT_MOST minutes become the limit if the remaining iterations would take longer. With a limit, the total is chosen
-    so that the remaining iterations fill the time that is left.
-    """
+    """Go back to an earlier iteration, and plan the rest within the time limit."""
     count, pace, plan = (1 - AGAIN) * state.total, state.seconds / max(state.iteration, 1), state.plan
     state.seconds = plan.before = 0.0
     state.clock.resume({}, 0.0)
@@ -85,7 +81,7 @@ def _go_back(state: State) -> None:
 
 @torch.no_grad()
 def _restart(state: State, names: tuple[str, ...], which: torch.Tensor, settings: Settings) -> None:
-    """Reset parameters of the surfels where `which` (N,) is true to the values with which surfels start under `settings`."""
+    """Reset parameters of the surfels where `which` (N,) is true to the initial values."""
     start = start_appearance(settings)
     for name in {*names} & state.learned.keys():
         value, row = state.learned[name], start[name][0]

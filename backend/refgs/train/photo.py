@@ -44,11 +44,11 @@ class Photo(NamedTuple):
 
     @property
     def encoded(self) -> Tensor:
-        """Return the sRGB-encoded photo as float32 (H, W, 3): 1 is white, and an EXR may be brighter."""
+        """Return the sRGB-encoded photo, float32 (H, W, 3); an EXR may exceed 1 (white)."""
         return self.image.float() / self.white
 
     def over(self, background: Tensor) -> Tensor:
-        """Composite the photo over a background colour (3,). Returns sRGB-encoded floats (H, W, 3), clipped to white."""
+        """Composite the photo over a background (3,), sRGB-encoded (H, W, 3) and clipped to white."""
         image = self.encoded.clamp_max(1)
         if self.mask is None:
             return image
@@ -57,12 +57,12 @@ class Photo(NamedTuple):
 
     @property
     def clipped(self) -> Tensor:
-        """Tell which channels are clipped, bool (H, W, 3). This includes values just below the largest one, because JPEG changes values."""
+        """Tell which channels, bool (H, W, 3), are clipped or nearly clipped."""
         return self.image.float() >= torch.iinfo(self.image.dtype).max // 255 * 254
 
 
 def crop_of(view: LoadedView, margin: int) -> Crop:
-    """Return the crop that shows the object: the bounds of the photo's mask plus `margin` pixels. Without a mask: the whole photo."""
+    """Return the mask's bounds plus `margin` pixels, or the whole photo without a mask."""
     height, width = view.image.shape[:2]
     return (slice(0, height), slice(0, width)) if view.alpha is None else bounds(view.alpha, margin)
 

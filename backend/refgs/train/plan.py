@@ -12,14 +12,14 @@ MIRRORED = 1.2  # factor on the time for inter-reflection: 1 without, 1.4 if muc
 
 
 class Stage(NamedTuple):
-    """Describe a stage of a training. Until the progress `until` (0..1), the photos' sides are divided by `factor` (`learn/coarse.py`)."""
+    """Describe a training stage: until the progress `until`, photos' sides are divided by `factor`."""
 
     until: float
     factor: int
 
     @property
     def cost(self) -> float:
-        """Return the time of an iteration, as a fraction of the time of an iteration on full photos."""
+        """Return the time of an iteration relative to one on full photos."""
         return self.factor ** (-2 * BY_PIXELS)
 
 
@@ -48,15 +48,12 @@ def iterations_time(growth: float, progress: float, stages: tuple[Stage, ...] = 
 
 
 def growth(first: int, last: int) -> float:
-    """Estimate how many times longer an iteration takes at the end of the training than at the start.
-
-    The training starts with `first` surfels and ends with `last`.
-    """
+    """Estimate by which factor iterations slow down until the end, from `first` to `last` surfels."""
     return MIRRORED * (OTHERS + max(last, first)) / (OTHERS + first)
 
 
 class Plan:
-    """Plan a training that must end within a given time, including the writing of its asset. Pauses do not count."""
+    """Plan a training, asset included, to end within a given time, not counting pauses."""
 
     def __init__(self, minutes: float | None):
         """Start the clock. Without `minutes` there is no limit."""
@@ -66,11 +63,11 @@ class Plan:
 
     @property
     def spent(self) -> float:
-        """Return the seconds since the command was started, plus those spent before the run was resumed."""
+        """Return the seconds since the command started, plus those before the run was resumed."""
         return self.before + time.perf_counter() - self._begun
 
     def wait(self, seconds: float) -> None:
-        """Record that the training has paused for `seconds`, which then do not count as time spent. This method does not wait."""
+        """Exclude `seconds`, during which the training has paused, from the time spent."""
         self._begun += seconds
 
     @property
@@ -102,7 +99,7 @@ class Plan:
         pace, left = (now - then) / (iteration - half), 60 * self.minutes - now
 
         def seconds_left(total: int) -> float:
-            """Estimate the seconds from now to the end, including the asset, if the training has `total` iterations."""
+            """Estimate the seconds left, including the asset, for a training of `total` iterations."""
             whole, by_now, by_half = (
                 iterations_time(self._growth, k / total, self._stages) * total for k in (total, iteration, half)
             )

@@ -38,7 +38,7 @@ def without_specular(inputs: RenderInputs) -> RenderInputs:
 
 
 def picture(state: State, view: int, inputs: RenderInputs, whole: bool = False) -> Rendering:
-    """Render a training view. Render only the crop that the training uses, or the whole view if `whole` is true."""
+    """Render a training view: the crop that the training uses, or the `whole` view."""
     return state.picture(inputs, state.photo(view, whole).camera, exposure(state, view))
 
 
@@ -54,7 +54,7 @@ class Lost(NamedTuple):
 
 
 def decibels_lost(errors: Tensor, without: Tensor) -> float:
-    """Compute by how many dB the PSNR falls if pixels' squared errors rise from `errors` (P,) to `without` (P,)."""
+    """Compute by how many dB the PSNR falls from squared errors `errors` to `without`."""
     return 10 * math.log10(max(float(without.sum()), 1e-12) / max(float(errors.sum()), 1e-12))
 
 
@@ -75,7 +75,7 @@ def lost(views: Iterable[tuple[Tensor, Tensor, Tensor]]) -> Lost:
 
 
 def spread_views(state: State, most: int = VIEWS) -> list[int]:
-    """Return the indices of at most `most` training views, evenly spaced in the order of the photos."""
+    """Return the indices of at most `most` training views, evenly spaced."""
     return [*spread(range(len(state.photos)), most)]
 
 
@@ -111,7 +111,7 @@ def psnr_loss(state: State, change: Change, inputs: RenderInputs | None = None) 
 def _on_object(
     state: State, inputs: RenderInputs, views: list[int], pairs: Iterable[Sequence[Tensor]]
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Yield three tensors (P, 3) for each of the `views`: the object's pixels in the view's two pictures of `pairs`, and in the photo."""
+    """Yield the object's pixels (P, 3) of each view, in both pictures and the photo."""
     for view, (one, other) in zip(views, pairs, strict=True):
         shown = on_object(state, inputs.surfels, view)
         yield one[shown], other[shown], state.photo(view).over(state.background)[shown]
@@ -204,7 +204,7 @@ def reflections_explain(state: State) -> Lost:
 
 @torch.no_grad()
 def quantile(values: Tensor, weight: Tensor, part: float) -> float:
-    """Return the weighted quantile of `values` (N,): the value below which the fraction `part` of the total weight lies."""
+    """Return the weighted quantile of `values` (N,) at the fraction `part` of the weight."""
     order = values.argsort()
     share = weight[order].cumsum(dim=0) / weight.sum().clamp_min(1e-9)
     return float(values[order][int((share < part).sum().clamp_max(len(order) - 1))])

@@ -39,7 +39,7 @@ PARTS: tuple[type[Part], ...] = (
 
 
 def set_up(capture: Capture, effective: Effective, folder: Path, report: Report, plan: Plan, device: str) -> State:
-    """Read a capture's photos, and make all parameters and the optimiser, so that the first iteration can start."""
+    """Read a capture's photos, and make all parameters and the optimiser."""
     state = State(capture, effective, folder, report, plan, device)
     needs.evaluate(state, "photos")
     state.photos = [Photo.of(view, state.device) for view in state.views]
@@ -63,10 +63,7 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
 
 
 def _choose_light_frame(state: State, start: Parameters, on_hull: int) -> None:
-    """If `light.frame` is "auto", decide from the photos whether the light stands still in the world or turns with the camera.
-
-    `start` are the surfels' initial parameters. The first `on_hull` of these surfels lie on the visual hull.
-    """
+    """If `light.frame` is "auto", decide whether the light turns with the camera."""
     lit = state.method.lit
     if state.settings.light.frame != "auto":
         return
@@ -83,11 +80,7 @@ def _choose_light_frame(state: State, start: Parameters, on_hull: int) -> None:
 
 
 def _start_learning(state: State, start: Parameters) -> None:
-    """Start learning the surfels, the light and the photos' exposures.
-
-    Surfels start with the parameters `start`. Two kinds of parameters are not learned: those that do not affect this run's pictures,
-    and those that the rendering method fixes, as `reflection = mirror` fixes albedo.
-    """
+    """Start learning the surfels (from the parameters `start`), the light and the photos' exposures."""
     settings, method = state.settings, state.method
     state.learned = Learned(state.capture.radius, method.light.brightest)
     for name, value in start.items():
@@ -118,7 +111,7 @@ def _unused(state: State) -> list[str]:
 
 
 def start_residual(state: State, step: Step) -> None:
-    """Start to learn the residual: a view-dependent colour that explains what material and light do not."""
+    """Start to learn the residual: view-dependent colour that material and light do not explain."""
     state.residual = True
 
 

@@ -31,7 +31,7 @@ def start_parameters(
 
 
 def start_appearance(settings: Settings) -> Parameters:
-    """Make the initial colour and material parameters that all surfels share. Each has one row and no gradient."""
+    """Make the initial colour and material parameters, each with one row for all surfels."""
     one = FirstPoints(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.ones(1), None, None, "")
     made = _initial(one, settings.surfels, 0.5)
     return {name: value.detach() for name, value in made.items() if name not in GEOMETRY}

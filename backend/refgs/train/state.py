@@ -28,7 +28,7 @@ P = TypeVar("P")
 
 
 def spread(items: Sequence, most: int) -> Sequence:
-    """Return every n-th item, from the first one on, but at most `most` items. n is len(items) // most, and at least 1."""
+    """Return at most `most` items, every n-th from the first one on."""
     return items[:: max(1, len(items) // most)][:most]
 
 
@@ -79,11 +79,11 @@ class State:
         self.parts: dict[type, Any] = {}
 
     def part(self, kind: type[P]) -> P:
-        """Return the object of the class `kind`, in which one module of the training keeps its own facts (see `train/part.py`)."""
+        """Return the object of class `kind`, which holds one training module's own facts."""
         return self.parts[kind]
 
     def needed(self, name: str) -> bool:
-        """Tell whether the scene needs the optional feature `name` (see `train/decide`). True until that is decided."""
+        """Tell whether the scene needs the optional feature `name`, true until that is decided."""
         return name not in self.needs or self.needs[name].needed
 
     @property
@@ -93,7 +93,7 @@ class State:
 
     @property
     def from_hull(self) -> bool:
-        """Tell whether surfels start on the visual hull of the masks. They do if all photos have masks."""
+        """Tell whether surfels start on the visual hull: all photos have masks."""
         return all(view.alpha is not None for view in self.views)
 
     @property
@@ -122,14 +122,14 @@ class State:
 
     @property
     def losses(self) -> LossSettings:
-        """Return the loss weights. Without specular shading, the terms on metallic and roughness have the weight 0."""
+        """Return the loss weights, 0 for metallic and roughness terms without specular shading."""
         weights = self.settings.loss
         if self.settings.render.reflection == "none":
             return weights.model_copy(update={"even": 0.0, "metallic": 0.0, "matte": 0.0})
         return weights
 
     def surfels(self) -> Surfels:
-        """Compute the surfels from raw parameters (before activation). A parameter that does not learn has one value for all surfels."""
+        """Compute all surfels from the raw parameters (before activation)."""
         count = self.learned.count
         values = activate(self.learned.by_row | self.learned.constant)
         if self.method.lit and self.settings.render.diffuse == "irradiance" and not self.residual:
@@ -137,36 +137,36 @@ class State:
         return Surfels(*(v if len(v) == count else v.expand(count, *v.shape[1:]) for v in values))
 
     def environment(self) -> Environment | None:
-        """Make the light from its raw texels (before activation). Return None if the rendering method uses no light."""
+        """Make the light from its raw texels; None if the method uses no light."""
         if not self.method.lit:
             return None
         reference = self.views[0].camera if self.settings.light.frame == "camera" else None
         return Environment(self.method.light.radiance(self.learned["environment"]), reference)
 
     def inputs(self) -> RenderInputs:
-        """Gather the inputs of a rendering: the surfels, the light, the render settings and the mesh for inter-reflection."""
+        """Gather the surfels, light, settings and mesh for a rendering."""
         settings = self.settings.render
         settings = initial_stage(settings) if self.initial else settings
         return RenderInputs(self.surfels(), self.environment(), settings, self.occluder)
 
     def picture(self, inputs: RenderInputs, camera: Camera, exposure: Tensor | None = None) -> Rendering:
-        """Render a camera's picture from `inputs`, with gradients. `exposure` (3,) are factors for its linear red, green and blue."""
+        """Render with gradients; `exposure` (3,) are factors for linear red, green and blue."""
         surfels, environment, settings, occluder = inputs
         return render(surfels, environment, camera, self.background, settings, self.near, occluder, exposure)
 
     @torch.no_grad()
     def render(self, camera: Camera, surfels: Surfels | None = None) -> Rendering:
-        """Render a camera's picture without gradients, from `surfels` if they are given, else from all surfels."""
+        """Render without gradients, from `surfels` or, if None, from all surfels."""
         inputs = self.inputs()
         return self.picture(inputs if surfels is None else inputs._replace(surfels=surfels), camera)
 
     def photo(self, view: int, whole: bool = False) -> Photo:
-        """Return a training view's photo in the size in which it was loaded. If `whole` is false, it is cropped to the pixels in use."""
+        """Return a view's photo as loaded, cropped to the pixels in use unless `whole`."""
         photo = self.photos[view]
         return photo if whole or self.crops is None else photo.part(*self.crops[view])
 
     def spread_cameras(self, least: int) -> list[Camera]:
-        """Return the cameras of at least `least` training views, evenly spaced. If there are fewer views, return all cameras."""
+        """Return at least `least` evenly spaced training cameras, or all if there are fewer."""
         return [view.camera for view in self.views[:: max(1, len(self.views) // least)]]
 
     def wanted(self) -> Tensor:
@@ -180,16 +180,13 @@ class State:
         return torch.from_numpy(box.contains(position.numpy(force=True))).to(self.device)
 
     def announce(self, about: str, what: str) -> None:
-        """Report a decision to the user, unless the same text was reported before. `about` names the decision, and `what` is the text."""
+        """Report the decision `about` to the user, unless the same `what` was reported before."""
         if self.decided.get(about) != what:
             self.decided[about] = what
             self.report("decided", {"about": about, "what": what})
 
     def change(self, key: str, value: Any, by: By, why: str) -> None:
-        """Change a setting for the rest of the training. Its `key` is "section.name".
-
-        `by` says what caused the change, and `why` explains it in words.
-        """
+        """Change the setting `key` ("section.name") from now on, recording its cause `by` and `why`."""
         self.effective = self.effective.changed(key, value, by, why)
 
 

@@ -50,7 +50,7 @@ Test = Callable[[State, Step], bool]
 
 
 class When(NamedTuple):
-    """Hold a time or a condition. `holds` returns True after the time, or while the condition is true. `words` are for docs/timeline.md."""
+    """Hold a condition, for example that a time has passed, with `words` for docs/timeline.md."""
 
     words: str
     holds: Test
@@ -61,7 +61,7 @@ class When(NamedTuple):
 
 
 class Every(NamedTuple):
-    """Hold a period. `length` computes it in iterations, 0 for never. `words` describe it in docs/timeline.md."""
+    """Hold a period in iterations, 0 for never, and its `words` for docs/timeline.md."""
 
     words: str
     length: Callable[[State], int]
@@ -106,7 +106,7 @@ def part(of: float) -> When:
 
 
 def part_after_initial(of: float) -> When:
-    """Return the time when the fraction `of` of the training has passed since the end of the initial stage (see `start_deferred`)."""
+    """Return when the fraction `of` of the training has passed after the initial stage."""
     return When(f"`initial.until` + {of:.0%}", lambda state, step: step.progress - state.settings.initial.until >= of)
 
 
@@ -143,16 +143,13 @@ def decidable(state: State, done: int) -> bool:
 
 
 def metals_decidable(state: State, done: int) -> bool:
-    """Tell whether photos can show what is metal. This needs `decidable`, `reflection` "microfacet", and no propagation of normals."""
+    """Tell whether the photos can show what is metal."""
     settings = state.settings
     return settings.render.reflection == "microfacet" and not settings.propagation.every and decidable(state, done)
 
 
 def since_propagation(state: State, done: int) -> int | None:
-    """Count the iterations since normals were last propagated (see `propagate_normals`).
-
-    Returns None if normals have not been propagated yet, or are no longer propagated.
-    """
+    """Count the iterations since normals were propagated; None before this begins or after it ends."""
     settings = state.settings.propagation
     if not settings.every or done < settings.every or not state.method.lit:
         return None
@@ -188,7 +185,7 @@ def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total:
 
 
 def stage_at(progress: float, stages: tuple[Stage, ...]) -> Stage:
-    """Return the stage of a training at a progress of 0..1. Stages differ in the size of the photos."""
+    """Return the stage of a training at a progress of 0..1."""
     return next(stage for stage in stages if progress < stage.until or stage.until == 1)
 
 
@@ -202,20 +199,17 @@ def even_by_logarithm(iteration: int) -> bool:
 
 
 def _late(state: State, part: float) -> float:
-    """Return the progress (0..1) at which the fraction `part` of the residual's learning time is over.
-
-    The residual, a colour added to the shaded one, learns from `state.residual_start` to the end of the training.
-    """
+    """Return the progress (0..1) at which the fraction `part` of residual learning is over."""
     return state.residual_start + part * (1 - state.residual_start)
 
 
 def _resets(state: State, step: Step) -> bool:
-    """Tell whether opacities may be reset: before `densify.stop`, and not in an iteration that propagates normals."""
+    """Tell whether opacities may be reset in this iteration."""
     return step.done / state.total < state.settings.densify.stop and since_propagation(state, step.done) != 0
 
 
 def _first_plan(state: State, step: Step) -> bool:
-    """Tell whether to plan the iterations now: 10 iterations after `Plan.begin`, when the pace is known, and at multiples of 50."""
+    """Tell whether to plan now: 10 iterations after `Plan.begin`, and at multiples of 50."""
     since = step.done - state.plan.first
     return since == 10 or (since > 0 and step.done % 50 == 0)
 

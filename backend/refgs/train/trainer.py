@@ -60,7 +60,7 @@ ACTIONS: dict[str, Callable[[State, Step], object]] = {
 
 
 def walk(rows: tuple[Row, ...], state: State, step: Step) -> None:
-    """Run the actions of the timeline's `rows` that are due at this step, in the order of the rows."""
+    """Run the actions of `rows` that are due at this step, in order."""
     for row in rows:
         if row.due(state, step):
             with state.clock.part(row.clock) if row.clock else nullcontext():
@@ -68,7 +68,7 @@ def walk(rows: tuple[Row, ...], state: State, step: Step) -> None:
 
 
 class Trainer:
-    """Train surfels, materials and light on a capture. Checkpoints in the run folder allow a run to be resumed."""
+    """Train surfels, materials and light on a capture, with checkpoints in the run folder."""
 
     def __init__(
         self,
@@ -101,7 +101,7 @@ class Trainer:
         return figures
 
     def _learn(self, step: Step) -> dict[str, Tensor]:
-        """Render the view, compare it with its photo, and take a step of Adam. Returns `loss` and the mean squared error, `square`."""
+        """Train on the step's view; return `loss` and the mean squared error, `square`."""
         state = self.state
         inputs, step.photo = state.inputs(), coarse.photo(state, step.view, WHOLE.due(state, step))
         step.rendering = state.picture(inputs, step.photo.camera, exposures.exposure(state, step.view))
@@ -120,10 +120,7 @@ class Trainer:
         return {"loss": loss.detach(), "square": square}
 
     def _next_view(self) -> int:
-        """Return the index of the next training view. Each epoch uses every view once, in a random order.
-
-        The order depends only on the seed and the epoch, so that a resumed run has the same order.
-        """
+        """Return the index of the next training view, in each epoch's random order."""
         epoch, place = divmod(self.state.iteration, len(self.state.views))
         if self._order[0] != epoch:
             generator = torch.Generator().manual_seed(self.state.settings.train.seed * 1_000_003 + epoch)
@@ -131,7 +128,7 @@ class Trainer:
         return self._order[1][place]
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> bool:
-        """Train to the end, or until `stop` returns true, and write a checkpoint. Returns whether the end was reached."""
+        """Train to the end or until `stop` returns true, save, and return whether it ended."""
         state, means = self.state, self.state.part(Means)
         before, first = state.seconds, state.iteration
         more = growth(state.learned.count, state.settings.surfels.budget)
@@ -165,10 +162,7 @@ class Trainer:
         state.report("progress", facts)
 
     def _should_stop(self, stop: Callable[[], bool]) -> bool:
-        """Call `stop` and return its answer.
-
-        `stop` may wait to pause the training. The time limit does not count the wait.
-        """
+        """Call `stop` and return its answer, without counting its pause as training time."""
         begun = time.perf_counter()
         stopped = stop()
         self.state.plan.wait(time.perf_counter() - begun)
@@ -189,7 +183,7 @@ class Trainer:
         return figures
 
     def _try_step(self) -> dict[str, Tensor] | None:
-        """Do one iteration. Returns what `step` returns, or None if the graphics card has run out of memory."""
+        """Do one iteration like `step`; return None if the graphics card's memory is full."""
         try:
             with self.state.clock.iteration(self.state.iteration):
                 return self.step()
@@ -204,11 +198,7 @@ class Trainer:
             trim()  # free the memory that decisions took
 
     def _check(self, whole: bool) -> None:
-        """Let `Guard.look` look for values that are not finite. If it returns a reason, go back to the last checkpoint, and warn.
-
-        The time spent since that checkpoint still counts as training time. If `whole` is true, all surfels are checked. Otherwise they are
-        checked only if a step was skipped, because its loss or gradients were not finite.
-        """
+        """Go back to the last checkpoint, with a warning, if `Guard.look` gives a reason."""
         state = self.state
         if why := self.guard.look(state, whole, lambda: checkpoint.complete(state.folder / CHECKPOINTS)):
             spent = state.seconds, dict(state.clock.seconds), state.plan.before
@@ -217,13 +207,13 @@ class Trainer:
             warn(state, why)
 
     def release_photos(self) -> None:
-        """Drop all photos after the training. They may be mapped from files, which Windows cannot remove as long as they are mapped."""
+        """Drop all photos after the training, because Windows cannot remove mapped files."""
         self.state.views, self.state.photos, self.state.test = [], [], []
         self.state.part(coarse.Coarse).photos = []
         del self.measures
 
     def resume(self) -> None:
-        """Resume from the last complete, undamaged checkpoint. Without one, do nothing at iteration 0, and raise NoCheckpoint later."""
+        """Resume from the last undamaged checkpoint; without one, raise NoCheckpoint unless at iteration 0."""
         try:
             snapshot.restore(self.state, self.state.folder)
         except checkpoint.NoCheckpoint:

@@ -7,7 +7,7 @@ from refgs.train.state import State
 
 
 class Initial(Need):
-    """Decide whether the training needs the initial stage, which shades surfels before blending. After it, pixels are shaded."""
+    """Decide whether the training needs the initial stage, which shades surfels before blending."""
 
     name, what = "initial", "a first stage of surfels shaded one by one"
     moments = ("start",)

@@ -68,15 +68,12 @@ class Reflections(Need):
 
 
 def share_hidden(hidden: float) -> str:
-    """Return a message for the user from `hidden`, the fraction (0..1) of the object's pixels in which the object mirrors itself."""
+    """Return a phrase that says how much (`hidden`, 0..1) of the object mirrors itself."""
     return f"the object mirrors itself on {hidden:.1%} of it"
 
 
 class Light(Need):
-    """Decide whether the scene needs the full resolution of the environment's light.
-
-    If not, the cubemap is reduced to the lowest resolution that still shows the object's sharpest reflections.
-    """
+    """Decide whether the scene needs the full-resolution light; if not, the cubemap is reduced."""
 
     name, what = "light", "all of the light's texels"
     threshold, reason = 0.01, "dB; a coarser light that costs more is not taken, whatever the roughness"
@@ -180,6 +177,6 @@ class Degrees(Need):
 
 
 def _shortened(inputs: RenderInputs, field: str, count: int) -> RenderInputs:
-    """Return a copy of `inputs` in which a field of the surfels, such as `sh_rest`, has only its first `count` harmonic coefficients."""
+    """Copy `inputs`, keeping only the first `count` harmonic coefficients of one field of the surfels."""
     values = {field: getattr(inputs.surfels, field)[:, :count]}
     return inputs._replace(surfels=inputs.surfels._replace(**values))

@@ -22,7 +22,7 @@ INDIRECT = "indirect_dc", "indirect_rest", "received"
 
 
 class Specular(Need):
-    """Decide whether the scene needs specular shading, which includes metallic, roughness and inter-reflection. A matte scene does not."""
+    """Decide whether the scene needs specular shading, with metallic, roughness and inter-reflection."""
 
     name, what = "specular", "specular shading"
     threshold = 0.3  # dB
@@ -81,7 +81,7 @@ class Specular(Need):
 
 
 def _learn_again(state: State, names: list[str]) -> None:
-    """Begin to learn the parameters `names`, which were left out before. All surfels start with the values in the settings."""
+    """Begin to learn parameters that were left out, from the values in the settings."""
     start, count = start_appearance(state.effective.asked), state.learned.count
     for name in names:
         row = start[name].to(state.device)
@@ -89,10 +89,7 @@ def _learn_again(state: State, names: list[str]) -> None:
 
 
 class Constants(Need):
-    """Decide whether splats.ply needs columns for metallic and roughness.
-
-    A column is left out if all surfels have about the same value in it.
-    """
+    """Decide whether splats.ply needs columns for metallic and roughness, which may be constant."""
 
     name, what = "constants", "columns for metallic and roughness"
     threshold, reason = 1 / 255, "no 8-bit texture shows a smaller spread"

@@ -56,10 +56,7 @@ class Given(NamedTuple):
 
 
 class Need:
-    """Describe an optional part of the training, such as inter-reflection, and how to decide whether a scene needs it.
-
-    `refgs.train.decide.needs` lists all of them.
-    """
+    """Describe an optional part of training, and how to decide whether a scene needs it."""
 
     name: ClassVar[str]  # also the key in the settings' `needs`
     what: ClassVar[str]  # words that the artist reads
@@ -76,7 +73,7 @@ class Need:
         return True
 
     def measure(self, state: State, given: Given) -> Decision | None:
-        """Decide whether the scene needs this optional part of the training. Returns None to make no decision."""
+        """Decide whether the scene needs this part; None means that nothing is decided."""
         raise NotImplementedError
 
     def apply(self, state: State, found: Found) -> None:
@@ -98,5 +95,5 @@ class Need:
 
 
 def megabytes(state: State, names: tuple[str, ...]) -> float:
-    """Compute how much memory training these parameters takes, in MB: their values, gradients and Adam's moments."""
+    """Compute how many MB it takes to train these parameters (values, gradients, Adam's moments)."""
     return sum(state.learned[name].numel() for name in names if name in state.learned) * NUMBER / MEGA

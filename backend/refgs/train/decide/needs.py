@@ -44,7 +44,7 @@ def evaluate(state: State, moment: Moment, given: Given = Given()) -> list[str]:
 
 
 def look_again(state: State, step: Step) -> None:
-    """Bring back specular shading, and what was left out with it, if halfway through the training the scene proves not to be matte."""
+    """Bring back specular shading and what depends on it if the scene proves not matte."""
     if decision := SPECULAR.look_again(state):
         _bring_back_specular(state, decision)
 
@@ -67,11 +67,7 @@ def _bring_back_specular(state: State, decision: Decision) -> None:
 
 
 def _undo_following(state: State, decisions: dict[str, Found], why: str) -> None:
-    """Undo the decisions that followed from the decision to leave out specular shading.
-
-    Such a decision is deleted from `decisions`, and its part of the training is brought back. A decision stays if the user set it to "on"
-    or "off". `why` is the reason, for the record.
-    """
+    """Undo decisions that followed from leaving out specular shading, unless the user set them."""
     for need in NEEDS:
         if need.follows == SPECULAR.name and need.name in decisions and need.asked(state) == "auto":
             del decisions[need.name]
@@ -79,14 +75,14 @@ def _undo_following(state: State, decisions: dict[str, Found], why: str) -> None
 
 
 def reflections(state: State, step: Step) -> None:
-    """Decide with a new mesh whether inter-reflection is needed. If this was decided before, report how much the object mirrors itself."""
+    """Decide whether inter-reflection is needed, or report how much the object mirrors itself."""
     hidden = step.hidden or 0.0
     if not evaluate(state, "mesh", Given(step.done, hidden)):
         state.announce("reflections", f"with {Reflections.what}: {share_hidden(hidden)}")
 
 
 def _record(state: State, need: Need, decision: Decision) -> None:
-    """Record a decision about an optional part of the training, and report it. Leave the part out if it is not needed."""
+    """Record and report a decision, and leave the part out if it is not needed."""
     figures: dict[str, Any] = {key: float(value) for key, value in decision.figures.items()}
     if decision.statistic is not None:
         threshold = need.threshold if decision.threshold is None else decision.threshold

@@ -37,7 +37,7 @@ class Views(Need):
 
 
 class Outside(Need):
-    """Decide whether the training needs the pixels beyond the masks' bounds. If not, the photos are cropped."""
+    """Decide whether the training needs pixels beyond the masks; if not, photos are cropped."""
 
     name, what = "outside", "the pixels beyond the masks"
     threshold, reason = 0.1, "a part of the pixels; the time that less saves could not be measured"
@@ -61,7 +61,7 @@ class Outside(Need):
 
 
 def time_crops(state: State, step: Step) -> None:
-    """Measure once how many seconds training on cropped photos saves. Add them to the recorded decision to crop (see `Outside`)."""
+    """Measure once how many seconds cropping saves, and add them to the recorded decision."""
     if state.crops is not None and state.needs["outside"].seconds is None:
         seconds = (1 - 1 / WHOLE_EVERY) * probe.seconds_saved(state, whole=True)
         state.needs["outside"] = state.needs["outside"].model_copy(update={"seconds": seconds})
@@ -99,5 +99,5 @@ def motion(one: LoadedView, other: LoadedView, radius: float) -> float:
 
 
 def _agreement(one: LoadedView, other: LoadedView) -> float:
-    """Compute the PSNR in dB between two photos of the same size. sRGB-encoded values above 1 count as 1."""
+    """Compute the PSNR in dB between two photos of one size, clipped to white."""
     return psnr(*(np.minimum(view.encoded, 1) for view in (one, other)))

@@ -54,7 +54,7 @@ def write_pictures(state: State, name: str, found: Found) -> Pictures | None:
 
 
 def _reduced(picture: Tensor) -> np.ndarray:
-    """Return an encoded picture (H, W, 3) as uint8, at most SHOWN_SIDE pixels on its longer side."""
+    """Return an encoded picture as uint8, at most SHOWN_SIDE pixels on its longer side."""
     pixels = np.rint(255 * picture.numpy(force=True)).astype(np.uint8)
     scale = SHOWN_SIDE / max(pixels.shape[:2])
     if scale >= 1:
@@ -64,15 +64,12 @@ def _reduced(picture: Tensor) -> np.ndarray:
 
 
 def _specular(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render each view twice: with reflections, and with each surfel's mean reflection, which is the same in all views."""
+    """Render each view twice: with reflections, and with each surfel's mean reflection."""
     return probe.mirrored_and_mean(state, state.inputs(), views)
 
 
 def _reflections(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render each view twice, with two guesses of what a mirror ray sees where it hits the object. Yields nothing without a mesh.
-
-    The first guess is the object's mean radiance, the second is the environment's light. Only tracing would show what the ray sees.
-    """
+    """Render each view twice: self-reflections show the object's mean radiance, then the environment's light."""
     inputs = state.inputs()
     if inputs.occluder is None:
         return
@@ -82,7 +79,7 @@ def _reflections(state: State, found: Found, views: list[int]) -> Iterator[tuple
 
 
 def _mean_radiance(state: State, inputs: RenderInputs, views: list[int]) -> Tensor:
-    """Return the mean linear radiance (3,) of the object's pixels, in pictures of the views rendered from `inputs`."""
+    """Average the linear radiance (3,) of the object's pixels over renderings of the views."""
     shown = (
         probe.picture(state, view, inputs).radiance[probe.on_object(state, inputs.surfels, view)] for view in views
     )
@@ -90,10 +87,7 @@ def _mean_radiance(state: State, inputs: RenderInputs, views: list[int]) -> Tens
 
 
 def _light(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render each view twice: with the full-resolution light, and with the lower-resolution light that replaces it.
-
-    Yields nothing if the scene needs the full-resolution light, or if there is no specular shading.
-    """
+    """Render each view twice: with the full-resolution light, and with the reduced light."""
     inputs = state.inputs()
     if found.needed or inputs.settings.reflection == "none":
         return

@@ -30,10 +30,7 @@ def _redder(old: Explanation, size: float) -> Explanation:
 
 
 def _blurred(old: Explanation, size: float) -> Explanation:
-    """Return `old` with a blurred environment: each texel is blended with the mean of the texels around it.
-
-    `size` is the weight of this mean. The texels around are those on the same face, up to a sixteenth of the face's side away.
-    """
+    """Blend each texel of the environment with the mean around it, weighted by `size`."""
     side = round((len(old[1]) // 6) ** 0.5)
     faces = old[1].view(6, side, side, 3).permute(0, 3, 1, 2)
     reach = max(1, side // 16)
@@ -124,7 +121,7 @@ def ambiguities(state: State) -> dict[str, dict]:
 
 
 def _pictures(state: State, scene: Explanation, chosen: range) -> Iterator[Tensor]:
-    """Render `scene` in the training views with the indices `chosen`. Yield sRGB-encoded pictures (H, W, 3) in 0..1."""
+    """Render `scene` in the training views `chosen`, sRGB-encoded (H, W, 3) in 0..1."""
     light = Environment(scene[1].contiguous(), state.inputs().light.reference)
     inputs = RenderInputs(scene[0], light, state.settings.render, state.occluder)
     for view in chosen:

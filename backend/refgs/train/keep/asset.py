@@ -68,12 +68,12 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
 
 
 def _without_unlearned(surfels: Surfels, state: State) -> Surfels:
-    """Drop the surfels' residual colour (see `State.residual_start`) if the training ended before the residual could learn."""
+    """Drop the residual colour if the training ended before it could learn."""
     return surfels if surfels.sh_rest.any() else surfels.without_directions()
 
 
 def _without_untraced(surfels: Surfels, state: State) -> Surfels:
-    """If the training made no mesh to trace rays on, drop the surfels' inter-reflected light and set `received` to 1 (unoccluded)."""
+    """Without a mesh, drop the surfels' inter-reflected light and set `received` to 1."""
     if state.occluder is not None:
         return surfels
     nothing, whole = surfels.indirect_dc[:, :0], torch.ones_like(surfels.received)
@@ -82,13 +82,7 @@ def _without_untraced(surfels: Surfels, state: State) -> Surfels:
 
 @torch.no_grad()
 def _with_relightable_albedo(surfels: Surfels, state: State) -> Surfels:
-    """If the scene has a light, give the surfels both an albedo and SH colours.
-
-    Programs that light the surfels use the albedo. Programs that display the surfels without lighting use the SH colours.
-
-    If the training learned diffuse colour as SH, the albedo is computed: the mean SH colour divided by the irradiance. Metals take the
-    learned reflectance instead. If the training learned the albedo, the SH colour is computed: the albedo times the irradiance.
-    """
+    """If the scene has a light, give the surfels both an albedo and SH colours."""
     environment = state.environment()
     if environment is None:
         return surfels
@@ -145,11 +139,7 @@ def _write_refined_cameras(state: State) -> None:
 
 
 def _irradiance(surfels: Surfels, environment: Environment, state: State) -> Tensor:
-    """Compute the irradiance of each surfel, divided by π (N, 3).
-
-    If the light turns with the camera, average over the photos. In each photo the surfel is lit on the side that faces the camera, and
-    photos that show the surfel at a grazing angle count less.
-    """
+    """Compute each surfel's irradiance / π (N, 3), averaged over photos if the light turns."""
     normals = surfels.normals()
     if environment.reference is None:
         return (surfels.received * environment.diffuse(normals)).clamp_min(1e-6)
@@ -180,10 +170,7 @@ def _seen_side(surfels: Surfels, state: State) -> Tensor:
 
 
 def _needs_rows(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) -> list[dict[str, Any]]:
-    """Return the rows of needs.json. Each names a feature that the training left out or kept, the reason, and what leaving it out saved.
-
-    `side` (N,) is the result of `_seen_side`. `wanted` (N,) is true for surfels in the region to train.
-    """
+    """Return the rows of needs.json: features left out or kept, with reason and saving."""
     settings, method, left = state.settings, state.method, needs.rows(state)
 
     def add(what: str, why: str, saved: str) -> None:
@@ -212,7 +199,7 @@ def _needs_rows(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) ->
 
 
 def _why_no_mesh(state: State) -> str:
-    """Explain why a run that has inter-reflection switched on never made a mesh to trace it on."""
+    """Explain why a run with inter-reflection switched on never made a mesh."""
     indirect = state.settings.indirect
     first = max(indirect.every, max(indirect.start, state.settings.initial.until) * state.total)
     over = state.total * state.residual_start <= first

@@ -25,7 +25,7 @@ DAMAGED = ".damaged"  # added to the names of a checkpoint's files that cannot b
 
 
 class NoCheckpoint(InputError):
-    """Error for a folder without a complete checkpoint. A training that was killed before its first checkpoint can start over."""
+    """Report that a folder has no complete checkpoint."""
 
 
 def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
@@ -65,7 +65,7 @@ def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[s
 
 
 def complete(folder: Path) -> list[int]:
-    """List the iterations that have a complete checkpoint, in ascending order. Its files may be damaged: `load` notices."""
+    """List the iterations with a complete, but perhaps damaged, checkpoint, in ascending order."""
     return [iteration for iteration in _begun(folder) if all(file.exists() for file in _files(folder, iteration))]
 
 
@@ -87,23 +87,23 @@ def load(folder: Path, report: Report = lambda event, facts: None) -> tuple[dict
 
 
 def set_aside(file: Path) -> None:
-    """Rename a file that cannot be read: DAMAGED is added to its name. Do nothing if the file is missing or its folder is read-only."""
+    """Add DAMAGED to an unreadable file's name; ignore a missing file or read-only folder."""
     with suppress(OSError):
         os.replace(file, file.with_name(file.name + DAMAGED))
 
 
 def _begun(folder: Path) -> list[int]:
-    """List the iterations that have a TOML file, the last file of a checkpoint to be written, in ascending order."""
+    """List the iterations with a checkpoint's TOML file, in ascending order."""
     return sorted(int(file.stem) for file in folder.glob("*.toml") if file.stem.isdecimal() and len(file.stem) == 8)
 
 
 def _files(folder: Path, iteration: int) -> tuple[Path, Path]:
-    """Return the paths of a checkpoint's safetensors file and TOML file, in the order in which they are written."""
+    """Return the paths of a checkpoint's safetensors file and TOML file, in writing order."""
     return folder / f"{iteration:08d}.safetensors", folder / f"{iteration:08d}.toml"
 
 
 def _read(folder: Path, iteration: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read the tensors of a checkpoint, and the values in its TOML file. If it is damaged, raise one of the errors that `load` catches."""
+    """Read a checkpoint's tensors and TOML values; if damaged, raise an error that `load` catches."""
     data, note = _files(folder, iteration)
     whole_text = read_text(note, "").replace("\r\n", "\n")  # with the line ends that were hashed
     head, _, text = whole_text.partition("\n")
@@ -118,7 +118,7 @@ def _read(folder: Path, iteration: int) -> tuple[dict[str, Tensor], dict[str, An
 
 
 def _hash(data: Path, text: str) -> str:
-    """Hash a checkpoint's tensor file `data`, and the `text` of its TOML file after the first line, which holds the hash."""
+    """Hash a checkpoint's tensor file and the TOML `text` after the line with the hash."""
     found = hash_file(data)
     found.update(text.encode())
     return found.hexdigest()

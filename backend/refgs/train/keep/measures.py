@@ -23,7 +23,7 @@ ROWS = 128  # rows of the panoramas that are compared
 
 
 def held_out_psnr(state: State, most: int = MEASURED_VIEWS) -> float | None:
-    """Average the PSNR over at most `most` of the held-out views. Return None if there are no held-out views."""
+    """Average the PSNR over at most `most` held-out views; None without such views."""
     chosen = spread(state.test, most)
     if not chosen:
         return None
@@ -32,11 +32,7 @@ def held_out_psnr(state: State, most: int = MEASURED_VIEWS) -> float | None:
 
 
 class _TestView(NamedTuple):
-    """Hold a held-out view and its ground truth.
-
-    `known` holds true maps by name, such as normals. `alpha` (H, W) is the object's true coverage, 0..1. `relit` is a true picture under
-    another light, in linear RGBA (H, W, 4), or None.
-    """
+    """Hold a held-out view and its true maps, coverage (0..1) and relit picture (linear RGBA)."""
 
     view: LoadedView
     known: dict[str, np.ndarray]
@@ -84,7 +80,7 @@ class Measures:
         return _TestView(loaded, known, alpha, relit)
 
     def _read_lights(self, truth: GroundTruth, device: torch.device) -> None:
-        """Read the photos' light from the ground truth, and the other light under which it has true pictures. Either may be missing."""
+        """Read the true light, and the light of the relit pictures, if they exist."""
         if not self._method.lit:
             return
         # Else the training's light turns with the camera, and the true one does not.
@@ -121,7 +117,7 @@ class Measures:
         return found
 
     def flip(self, state: State) -> dict[str, float]:
-        """Average the image error FLIP over the first SLOW_VIEWS held-out views. Returns it under the name `flip_test`."""
+        """Average FLIP over the first SLOW_VIEWS held-out views, under the name `flip_test`."""
         chosen = self._test_views[:SLOW_VIEWS]
         values = [self._against_photo(metrics.flip, state.render(test.view.camera), test) for test in chosen]
         return {"flip_test": float(np.mean(values))} if values else {}
@@ -134,10 +130,7 @@ class Measures:
 
     @torch.no_grad()
     def _relit(self, state: State) -> float:
-        """Render the first SLOW_VIEWS held-out views under another light, and return the PSNR against their true pictures.
-
-        First, all renderings are multiplied by the one factor that fits them best to the true pictures.
-        """
+        """Return the PSNR of relit held-out views, after scaling all by the best factor."""
         settings = self.settings.render.model_copy(update={"reflection": "microfacet"})
         surfels = state.surfels().without_directions()
         pairs = []

@@ -12,11 +12,7 @@ from refgs.train.state import State
 
 
 class Means(Part):
-    """Hold running means of the values that `Trainer.step` returns. `values` is empty before the first step.
-
-    - `loss`: the training loss.
-    - `square`: the mean squared error.
-    """
+    """Hold running means of what `Trainer.step` returns: `loss` and `square`, the mean squared error."""
 
     name = "means"
 
@@ -30,7 +26,7 @@ class Means(Part):
         self.values = dict(facts)
 
     def add(self, figures: Mapping[str, Tensor]) -> None:
-        """Add the figures of an iteration to the means. This does not wait for a graphics card that is still computing the figures."""
+        """Add the figures of an iteration to the means, without waiting for the card."""
         self.values = {name: running(self.values.get(name, figure), figure) for name, figure in figures.items()}
 
     @property
@@ -45,6 +41,6 @@ class Means(Part):
 
 
 def running(mean: Tensor, figure: Tensor) -> Tensor:
-    """Return the exponential running mean after a new value, `figure`, with the weight 0.05. If `figure` is not finite, return `mean`."""
+    """Return the exponential running mean after `figure` (weight 0.05), which is ignored unless finite."""
     known = torch.where(mean.isfinite(), figure + 0.95 * (mean - figure), figure)
     return torch.where(figure.isfinite(), known, mean)

@@ -38,7 +38,7 @@ class Coarse(Part):
 
 
 def stages(pixels: float) -> tuple[Stage, ...]:
-    """Plan the stages for an object that spans `pixels` in the full photos. In reduced photos, it must span at least LEAST_SPAN pixels."""
+    """Plan the stages for an object that spans `pixels` in the full photos."""
     return *(Stage(*stage) for stage in PHOTO_STAGES if pixels / stage[1] >= LEAST_SPAN), *FULL
 
 
@@ -61,10 +61,7 @@ def begin(state: State, pixels: float, refined: bool) -> None:
 
 
 def refine(state: State, step: Step) -> None:
-    """Switch to larger photos when the training's progress reaches the stage that uses them.
-
-    If the training gets more iterations, its progress falls. The photos then keep their size.
-    """
+    """Switch to larger photos when the training's progress reaches the next stage."""
     coarse = state.part(Coarse)
     factor = stage_at(step.progress, coarse.stages).factor
     if factor < coarse.factor:
@@ -74,7 +71,7 @@ def refine(state: State, step: Step) -> None:
 
 
 def set_factor(state: State, factor: int) -> None:
-    """Set the factor by which the training photos are reduced, 1 for full photos, and make the reduced photos."""
+    """Reduce the training photos by a factor, 1 for full photos."""
     coarse = state.part(Coarse)
     if factor == coarse.factor:
         return
@@ -87,7 +84,7 @@ def set_factor(state: State, factor: int) -> None:
 
 
 def photo(state: State, view: int, whole: bool) -> Photo:
-    """Return a view's photo in the present stage's size. It is cropped to the pixels that are trained on, unless `whole` is true."""
+    """Return a view's photo in the present stage's size, cropped unless `whole` is true."""
     coarse = state.part(Coarse)
     if coarse.factor == 1:
         return state.photo(view, whole)
@@ -95,7 +92,7 @@ def photo(state: State, view: int, whole: bool) -> Photo:
 
 
 def move_camera(state: State, view: int, camera: Camera) -> None:
-    """Replace the camera of a training view's reduced photo, if there is one. `camera` is the new camera of the full photo."""
+    """Update the camera of a view's reduced photo from `camera`, that of the full photo."""
     coarse = state.part(Coarse)
     if coarse.factor > 1:
         small = coarse.photos[view]
@@ -103,7 +100,7 @@ def move_camera(state: State, view: int, camera: Camera) -> None:
 
 
 def cost(state: State, first: int, last: int) -> float:
-    """Estimate the time of the iterations from `first` to `last`. The unit is the time of one iteration on full photos."""
+    """Estimate the time of iterations `first` to `last`, in iterations on full photos."""
     stages = state.part(Coarse).stages
     begun, ended = (iterations_time(1.0, k / state.total, stages) for k in (first, last))
     return state.total * (ended - begun)

@@ -22,7 +22,7 @@ LEAST_LEFT = 1000
 
 
 class Densification(Part):
-    """Remember each surfel's mean screen gradient: how strongly the loss depends on its position on the screen (see `ScreenGradient`)."""
+    """Remember each surfel's mean screen gradient (see `ScreenGradient`)."""
 
     name = "densification"
 
@@ -45,14 +45,14 @@ class Densification(Part):
 
 
 def watch(state: State, step: Step, accepted: Tensor) -> None:
-    """Add this step's gradients of the positions to the mean screen gradients. Add nothing if `accepted`, a scalar tensor, is 0."""
+    """Add this step's gradients to the mean screen gradients, unless the scalar `accepted` is 0."""
     position, gradient = state.learned["position"], state.part(Densification).gradient
     if position.grad is not None:
         gradient.add(position.detach(), position.grad, state.photos[step.view].camera, accepted)
 
 
 def prune_and_divide(state: State, step: Step) -> None:
-    """Remove faint surfels. Until the progress `densify.stop`, also divide surfels with large screen gradients (see `densify`)."""
+    """Remove faint surfels, and divide surfels with large screen gradients until `densify.stop`."""
     settings, budget = state.settings.densify, state.settings.surfels.budget
     gradient = state.part(Densification).gradient.mean()
     if state.capture.box is not None:  # surfels outside the region may fill only the fraction AROUND of the budget
@@ -124,7 +124,7 @@ def thin(learned: Learned, count: int) -> None:
 
 
 def full_card() -> TryAgain:
-    """Return the exception to raise if the graphics card has too little memory. Its message tells the user what to do."""
+    """Return the exception to raise if the graphics card has too little memory."""
     return TryAgain("the card's memory is too small: close what else uses it, or take --device cpu")
 
 
@@ -145,10 +145,7 @@ def fewer_surfels(state: State) -> None:
 
 
 def _divide(learned: Learned, first: Tensor, second: Tensor) -> None:
-    """Turn the two copies of each of D surfels into halves that together cover as much as the surfel did.
-
-    `first` and `second` (D,) are the rows of the copies. The copies are moved apart and shortened along the surfel's longer axis.
-    """
+    """Turn each surfel's two copies, in rows `first` and `second` (D,), into its halves."""
     scale = learned["scale"][first]
     longer = scale.argmax(dim=1)
     rows = torch.arange(len(first), device=first.device)

@@ -17,7 +17,7 @@ BALANCED = 0.1  # largest difference of a channel's logarithm that may still be 
 
 
 class Exposures(Part):
-    """Hold `basis` (3, 3), the tensor of EXPOSURE. Its rows are logarithms of RGB factors, for brightness, temperature and tint."""
+    """Hold `basis` (3, 3), whose rows are log RGB factors of brightness, temperature and tint."""
 
     name = "exposures"
 
@@ -38,7 +38,7 @@ def exposure(state: State, view: int | slice) -> Tensor | None:
 
 @torch.no_grad()
 def balance(state: State, step: Step) -> None:
-    """Make the mean white balance of all photos neutral. Otherwise a coloured light could be mistaken for a white balance of all photos."""
+    """Make the mean white balance of all photos neutral."""
     weights = state.learned.get("exposure")
     if weights is not None and weights.shape[1] > 1:
         weights[:, 1:] -= weights[:, 1:].mean(dim=0)
@@ -46,7 +46,7 @@ def balance(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def leave_out_alike(state: State, step: Step) -> None:
-    """If `light.exposure` is "auto", stop learning exposures or white balances that are nearly equal in all photos."""
+    """Stop learning exposures or white balances that hardly differ, if `light.exposure` is "auto"."""
     exposures = exposure(state, slice(None))
     if exposures is None or state.settings.light.exposure != "auto":
         return

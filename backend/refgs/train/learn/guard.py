@@ -84,7 +84,7 @@ def warn(state: State, what: str) -> None:
 
 @torch.no_grad()
 def remove_broken(learned: Learned) -> int:
-    """Remove surfels that have a number that is not finite. Returns how many. Raises InputError if none would be left."""
+    """Remove surfels with non-finite numbers, and return how many; raise InputError if none remain."""
     finite = [value[:, None].flatten(1).isfinite().all(dim=1) for value in learned.by_row.values()]
     whole = torch.stack(finite).all(dim=0)
     count = int((~whole).sum())

@@ -23,14 +23,14 @@ MIRROR_VIEWS = 24  # views that tell which part of the light the object mirrors
 
 
 class MirroredLight(Part):
-    """Keep the texels' weights for `mean_radiance`: `weight` (6·R²,) is larger where more pixels mirror the texel. The weights sum to 1."""
+    """Hold `weight` (6·R²,), larger where more pixels mirror the texel, with a sum of 1."""
 
     name, saved = "light", ("weight",)
     weight: Tensor | None = None
 
 
 def start_value(state: State) -> float:
-    """Return the value at which the light's texels start, before activation. After activation, it is the setting `environment.radiance`."""
+    """Return the value, before activation, at which the light's texels start."""
     return state.method.light.raw(state.settings.environment.radiance)
 
 
@@ -44,7 +44,7 @@ def first_resolution(settings: Settings) -> int:
 
 @torch.no_grad()
 def refine(state: State, step: Step) -> None:
-    """Double the texels along a side of the light's cubemap, if they are fewer than `environment.resolution`."""
+    """Double the resolution of the light's cubemap, up to `environment.resolution`."""
     side = math.isqrt(len(state.learned["environment"]) // 6)
     if side >= state.settings.environment.resolution:
         return

@@ -37,7 +37,7 @@ _Work = struct("Losses", "losses.cpp")
 
 @timed("loss")
 class _Objective(Function):
-    """Compute the training loss as an autograd function. Its derivatives are computed together with its value."""
+    """Compute the training loss and its derivatives together, as an autograd function."""
 
     DIFFERENTIABLE = "color", "normal", "depth", "alpha", "material", "light"
 

@@ -77,7 +77,7 @@ class Poses(Part):
 
 @torch.no_grad()
 def refine(state: State, step: Step) -> None:
-    """Take one Gauss-Newton step with the pose of the view that this iteration trains on. Ignore a step that is not finite."""
+    """Refine the pose of this iteration's view by one Gauss-Newton step, if it is finite."""
     poses, photo = state.part(Poses), step.photo
     if poses.values is None:
         return
@@ -93,7 +93,7 @@ def refine(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def remove_common(state: State, step: Step) -> None:
-    """Subtract from all poses the motion that they share (see `_without_common`). It would only move or scale the whole scene."""
+    """Subtract from all poses their common motion, which would only move or scale the scene."""
     poses = state.part(Poses)
     if poses.values is not None:
         poses.put(state, _without_common(state, poses.values))
@@ -122,7 +122,7 @@ def judge(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def shifts(state: State) -> np.ndarray:
-    """Measure by how many pixels the refined poses move the surfels in each photo: the root mean square over some surfels, (V,)."""
+    """Measure by how many pixels (RMS) the refined poses move surfels in each photo (V,)."""
     positions = state.learned["position"].double().numpy(force=True)
     points = positions[:: max(1, len(positions) // SAMPLE)]
     points = np.concatenate([points, np.ones((len(points), 1))], axis=1)
@@ -152,7 +152,7 @@ def refined(state: State) -> Capture:
 
 
 def _without_common(state: State, values: Tensor) -> Tensor:
-    """Return the poses without their common motion: the mean pose, and the mean motion towards the cameras, which scales the scene."""
+    """Return the poses without their mean and their mean motion towards the cameras."""
     towards = np.array([camera.position - state.capture.centre for camera in state.part(Poses).given])
     towards = torch.from_numpy(towards / np.linalg.norm(towards, axis=1, keepdims=True)).float()
     poses = values - values.mean(dim=0)

@@ -97,7 +97,7 @@ def loss(state: State, step: Step) -> Tensor | None:
 
 
 def fade(progress: float) -> float:
-    """Return the factor on the weight of priors at a progress of 0..1: half a cosine wave, from 1 down to 0 at FADED."""
+    """Return the factor on priors' weights, which falls from 1 to 0 at progress FADED."""
     return 0.5 + 0.5 * math.cos(math.pi * min(progress / FADED, 1.0))
 
 
@@ -185,13 +185,13 @@ def axes_of(pairs: Iterable[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor | No
 
 
 def _with_axes(state: State, normals: Maps) -> Maps:
-    """Turn the maps of normals to the axes of their cameras. Return {} if the surfels' normals do not tell in which axes the files are."""
+    """Turn maps of normals to their cameras' axes; return {} if their axes are unknown."""
     if not normals:
         return {}
     turn = split_similarity(state.capture.to_capture)[1]
 
     def to_camera(view: int) -> Tensor:
-        """Return the rotation (3, 3) from the world of the capture's files to the view's camera."""
+        """Return the rotation (3, 3) from the files' world to the view's camera."""
         return torch.from_numpy(state.views[view].camera.world_to_camera[:3, :3] @ turn.T).to(state.device).float()
 
     def pairs() -> Iterable[tuple[Tensor, Tensor, Tensor]]:
@@ -225,10 +225,7 @@ def _with_axes(state: State, normals: Maps) -> Maps:
 
 
 def _near_outline(photo: Photo) -> Tensor:
-    """Tell which pixels (H, W) lie just inside the outline of a photo's mask.
-
-    There the visual hull has the surface's normals. Farther inside, its normals may differ: over a bowl, the hull has a lid.
-    """
+    """Tell which pixels (H, W) lie just inside the outline of a photo's mask."""
     if photo.mask is None:
         return torch.zeros(photo.image.shape[:2], dtype=torch.bool, device=photo.image.device)
     shown = (photo.mask > 127).float()[None]
@@ -238,10 +235,7 @@ def _near_outline(photo: Photo) -> Tensor:
 
 
 def _with_kind(state: State, depth: Maps) -> tuple[Maps, bool]:
-    """Return the maps of depth, and whether they hold disparities. These fall where depth rises: their correlation with depth is negative.
-
-    Returns no maps if these hardly correlate with the depth of the initial surfels.
-    """
+    """Return the maps ({} if unrelated to the initial depth), and whether they hold disparities."""
     if not depth:
         return {}, False
     found = []
@@ -263,16 +257,12 @@ def _with_kind(state: State, depth: Maps) -> tuple[Maps, bool]:
 
 
 def _counts(rendering: Rendering, photo: Photo) -> Tensor:
-    """Return each pixel's weight (H, W) in a loss: the mask's alpha, 0..1, where the surface is opaque, else 0."""
+    """Return pixels' weights (H, W): the mask's alpha (0..1), or 0 where not opaque."""
     opaque = (rendering.alpha.detach() > SOLID).float()
     return opaque if photo.mask is None else opaque * (photo.mask.float() / 255)
 
 
 def _saturating(error: Tensor, half: float, counts: Tensor, photo: Photo) -> Tensor:
-    """Compute a saturating loss: Σ counts · error / (error + half), divided by the number of pixels of the whole photo.
-
-    `counts` (H, W) are weights of pixels. An error equal to `half` gives a loss of 1/2. Much larger errors give nearly 1, so that wrong
-    priors have a limited effect.
-    """
+    """Compute Σ counts · error / (error + half) per pixel of the whole photo."""
     rows, columns = photo.whole or photo.image.shape[:2]
     return (counts * error / (error + half)).sum() / (rows * columns)

@@ -5,7 +5,7 @@ from refgs.train.timeline import FROZEN, REFLECTING, Step
 
 
 def set_rates(state: State, step: Step) -> None:
-    """Set the learning rate of each learned tensor for this iteration: decayed by its progress, or 0 while the tensor is frozen."""
+    """Set each learned tensor's learning rate for this iteration, 0 while it is frozen."""
     rates, late, progress = state.settings.rates, state.residual_start, step.progress
     frozen = {name for names, row in FROZEN if row.due(state, step) for name in names}
     for name in state.learned:

@@ -43,7 +43,7 @@ class TracedMesh(Part):
 
 @torch.no_grad()
 def make_mesh(state: State, step: Step) -> None:
-    """Make the mesh `state.occluder` from the surfels. Set `step.hidden` to the fraction of the object's pixels that mirror the object."""
+    """Make the mesh `state.occluder`, and `step.hidden`, the fraction of pixels that mirror the object."""
     if why_not_traced(state):
         return
     with state.clock.part("visibility"):
@@ -74,7 +74,7 @@ def make_mesh(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def trace_received(state: State, step: Step) -> None:
-    """Trace on the new mesh each surfel's `received`: its irradiance divided by that of an unoccluded surface."""
+    """Trace each surfel's `received`: its irradiance relative to that of an unoccluded surface."""
     if state.occluder is None or "received" not in state.learned:
         return
     traced = Surfels(*(value.cpu() for value in with_normals_last(state.surfels())))

@@ -110,7 +110,7 @@ def _explained(observations: Observations, relative: Tensor, known: Tensor, cell
 
 
 def _unexplained(target: Tensor, columns: Tensor, weight: Tensor, fitted: Tensor) -> float:
-    """Fit `columns` (P, K) to `target` (P,) by ridge regression in the rows `fitted` (P,). Return the other rows' mean squared residual."""
+    """Fit `columns` (P, K) to `target` (P,) where `fitted`; return the others' mean squared residual."""
     rows = columns[fitted] * weight[fitted, None]
     square = rows.T @ columns[fitted]
     ridge = RIDGE * square.diagonal().mean().clamp_min(1e-12) * torch.eye(len(square)).to(square)

@@ -27,7 +27,7 @@ def coloured_metal(surfels: Surfels) -> Tensor:
 
 @torch.no_grad()
 def even_out(state: State, step: Step) -> None:
-    """Average the base colour and roughness of coloured metal over neighbouring surfels of coloured metal, weighted by their opacity."""
+    """Average base colour and roughness of coloured metal over neighbouring surfels of coloured metal."""
     if not state.part(Metals).found:
         return
     surfels = state.surfels()

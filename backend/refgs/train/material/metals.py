@@ -29,7 +29,7 @@ HELD = Kinds(metal=0.98, paint=0.002)  # metallic that does not learn, in the or
 
 
 class Metals(Part):
-    """Remember in `found` whether metals have already been found, from the photos or from the user's hints."""
+    """Remember in `found` whether metals have already been found."""
 
     name, saved = "metals", ("found",)
     found = False
@@ -146,7 +146,7 @@ def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
 
 @torch.no_grad()
 def hold_as(state: State, kinds: torch.Tensor) -> None:
-    """Set and hold the metallic value of surfels by their `kinds` (N,): 0 for metal, 1 for paint, −1 for surfels that still learn it."""
+    """Set and hold metallic values by `kinds` (N,): 0 metal, 1 paint, −1 not held."""
     for number in range(len(HELD)):
         state.learned["metallic"][kinds == number] = raw_metallic(HELD[number])
     state.learned["held"].copy_(kinds >= 0)
@@ -155,7 +155,7 @@ def hold_as(state: State, kinds: torch.Tensor) -> None:
 
 
 def hold(state: State) -> None:
-    """Remove the gradient of the metallic values where `held` (N,) is true, so that these values do not change."""
+    """Zero the gradient of metallic values where `held` (N,) is true."""
     metallic = state.learned.get("metallic")
     if metallic is not None and metallic.grad is not None:
         metallic.grad.masked_fill_(state.learned["held"], 0)

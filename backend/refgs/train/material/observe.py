@@ -55,7 +55,7 @@ class Observations(NamedTuple):
 
     @property
     def usable(self) -> Tensor:
-        """Tell which photos show which surfels well enough (N, V). A surfel that too few photos show has no usable photo."""
+        """Tell which photos show which surfels well enough (N, V)."""
         shown = self.pixels > LEAST_PIXELS
         return shown & (shown.sum(dim=1, keepdim=True) >= LEAST_VIEWS)
 
@@ -80,7 +80,7 @@ class Seen(NamedTuple):
 
     @property
     def outward(self) -> Tensor:
-        """Return one unit normal for each surfel (N, 3). It points towards the cameras that see the surfel."""
+        """Return a unit normal (N, 3) of each surfel, towards the cameras that see it."""
         return torch.nn.functional.normalize((self.normal * self.weight[..., None]).sum(dim=1), dim=1)
 
 
@@ -120,7 +120,7 @@ def observe_changes(state: State) -> Observations:
 
 @torch.no_grad()
 def observe_mirrored(state: State, inputs: RenderInputs, views: list[int]) -> Seen:
-    """Observe the surfels of `inputs` in the training photos with the indices `views`. The photos' exposures are divided out."""
+    """Observe the surfels in the training photos `views`, with exposures divided out."""
     sums = [_sums(state, inputs, view) for view in views]
     radiance, pixels, clipped, normal = torch.stack(sums, dim=1).cpu().split([3, 1, 1, 3], dim=2)
     towards = _towards(inputs.surfels, [state.photo(view) for view in views]).cpu()
@@ -132,7 +132,7 @@ def observe_mirrored(state: State, inputs: RenderInputs, views: list[int]) -> Se
 
 
 def _sums(state: State, inputs: RenderInputs, view: int) -> Tensor:
-    """Sum over each surfel's pixels in a photo (N, 8): linear radiance, weights, weights of clipped pixels, and blended normals."""
+    """Sum each surfel's pixels (N, 8): linear radiance, weights, clipped weights, and blended normals."""
     photo, factor = state.photo(view), exposure(state, view)
     radiance = _linear(photo)
     radiance = radiance if factor is None else radiance / factor
@@ -202,7 +202,7 @@ def _fitted(factor: Tensor, totals: Tensor, pixels: Tensor, mean: Tensor, light:
 
 
 def from_grey(colour: Tensor) -> Tensor:
-    """Return how far the chromaticities of linear colours (N, 3) are from grey: each channel divided by the channels' sum, less 1/3."""
+    """Return the chromaticities of linear colours (N, 3), minus that of grey."""
     return colour / colour.sum(dim=1, keepdim=True).clamp_min(1e-6) - 1 / 3
 
 
@@ -234,7 +234,7 @@ def neighbours(positions: Tensor, most: int, of: Tensor | None = None) -> Tensor
 
 
 def pooled(values: Tensor, near: Tensor) -> Tensor:
-    """Sum the rows of `values` (N, …) over neighbours, whose indices are `near` (M, K). Returns (M, …)."""
+    """Sum the rows of `values` (N, …) over neighbours `near` (M, K), giving (M, …)."""
     total = values.new_zeros(len(near), *values.shape[1:])
     for column in near.T:
         total += values[column]

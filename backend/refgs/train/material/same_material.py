@@ -89,10 +89,7 @@ def doubt(surfels: Surfels, seen: Seen, fit: Fit) -> Tensor:
 
 
 def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the Laplacian (N, N) of neighbouring surfels, which surfels can be judged (N,), and evidence for metal and for paint (N,).
-
-    A surfel can be judged (1, else 0) if photos show it in more than FRINGE pixels. Evidence lies between 0 (none) and SURE (most).
-    """
+    """Return the Laplacian, which surfels can be judged, and evidence for metal and for paint."""
     graph, part = _laplacian(surfels.positions, seen), (seen.pixels > FRINGE).double().numpy()
     ratio = np.asarray((fit.ratio.clamp(1e-3, 1e3).log().double() * fit.seen).numpy())
     mirrors = (fit.slope > SLOPE) & (fit.reflectance.amax(dim=1) > REFLECTANCE)
@@ -114,7 +111,7 @@ def _solve(graph: sparse.csr_matrix, weight: np.ndarray, weighted: np.ndarray) -
 
 
 def _laplacian(positions: Tensor, seen: Seen) -> sparse.csr_matrix:
-    """Return the Laplacian (N, N) of a graph of neighbouring surfels. Edges on a smooth surface of one brightness weigh most, up to 1."""
+    """Return the Laplacian (N, N) of neighbouring surfels, with edge weights from 0 to 1."""
     points, near = positions.double().numpy(), neighbours(positions, LINKED + 1)[:, 1:].numpy()
     count = len(points)
     one, other = np.repeat(np.arange(count), near.shape[1]), near.ravel()
