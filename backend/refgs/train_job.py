@@ -264,6 +264,7 @@ def _removed_if_empty(out: Path) -> Iterator[None]:
 @contextmanager
 def _no_photos_left(out: Path) -> Iterator[None]:
     """Delete the cached reduced photos in `out` if the `with` block raises."""
+    # The run does not exist yet, so no training can be resumed that would need them.
     try:
         yield
     except BaseException as error:
@@ -301,6 +302,8 @@ def _resumed(trainer: "Trainer") -> "Trainer":
 
 def _finish(trainer: "Trainer") -> float | None:
     """Write the results and metrics.json; return the mean held-out PSNR, None without held-out views."""
+    # splats.ply is written last, because a run that has it counts as finished: a training that is killed here is resumed, and this runs
+    # again.
     from refgs.run import record_changes
     from refgs.train.keep.ambiguity import ambiguities
     from refgs.train.keep.asset import write_asset

@@ -41,6 +41,8 @@ def carve_hollows(alpha: np.ndarray, low: np.ndarray, voxel: np.ndarray, photos:
 
 def _empty(shape: Shape, maps: Sequence[DepthMap], least: float) -> np.ndarray:
     """Find a shape's empty voxels (X, Y, Z), which at least `least` maps see through."""
+    # A depth map votes "empty" in cells in front of its surface and "full" in cells on it, with the weight of its depth there. Votes are
+    # smoothed over neighbouring cells; a cell needs more than the fraction FREE of them.
     cells = np.argwhere(shape.solid)
     points = shape.low + (cells + 0.5) * shape.voxel
     band = BAND * shape.ball[1]

@@ -167,6 +167,7 @@ def _sample_triangles(vertices: np.ndarray, faces: np.ndarray, count: int, rng: 
 
 def _choose_evenly(dense: np.ndarray, count: int) -> np.ndarray:
     """Choose `count` evenly spaced points (count, 3) from `dense` by Lloyd iterations."""
+    # Each iteration groups the points by the nearest chosen one, and then chooses the point nearest to its group's mean.
     chosen = dense[:: len(dense) // count][:count]
     for _ in range(5):
         cell = cKDTree(chosen).query(dense)[1]

@@ -83,6 +83,8 @@ def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def _untrimmed(mesh: trimesh.Trimesh) -> np.ndarray:
     """Mark the faces (F,) that belong neither to crumbs nor to frays (see `clean`)."""
+    # A morphological opening: FRAY rings of faces are removed along the borders, and the pieces that are crumbs then; what remains grows
+    # back. Surfaces fray where photos end, because few photos show what is there.
     border = np.zeros(len(mesh.vertices), bool)
     border[_border(mesh)] = True
     core = ~_grown(border, mesh.faces, FRAY - 1)[mesh.faces].any(axis=1)
@@ -111,6 +113,7 @@ def _grown(marked: np.ndarray, faces: np.ndarray, rings: int) -> np.ndarray:
 
 def _manifold(mesh: trimesh.Trimesh) -> np.ndarray:
     """Mark the faces (F,) to keep so that no edge has more than two faces."""
+    # Edges with three faces arise when simplification folds a thin part of the mesh. The two largest are kept.
     _, edge = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
     edge, face = edge.reshape(-1), mesh.edges_face
     order = np.lexsort((-mesh.area_faces[face], edge))

@@ -146,6 +146,8 @@ def _neighbours(cameras: list[Camera], centre: np.ndarray) -> list[np.ndarray]:
 
 def _sweep(photo: _Reduced, others: list[_Reduced], shape: Shape, unsure: np.ndarray) -> DepthMap:
     """Find depths where rays enter `unsure` voxels, by comparing the photo with `others` on planes."""
+    # A pixel gets the depth of the plane on which the photo looks most like the others, among planes that its ray meets near or in a solid
+    # voxel of the shape.
     camera, (centre, radius) = photo.camera, shape.ball
     middle = float(camera.world_to_camera[2, :3] @ centre + camera.world_to_camera[2, 3])
     planes = 1 / np.linspace(1 / max(middle - radius, radius / 100), 1 / (middle + radius), PLANES)

@@ -111,6 +111,7 @@ def compositions() -> Tensor:
 @lru_cache(maxsize=32)
 def _padded_texels(resolution: int) -> Tensor:
     """Return texel indices (6, R+2, R+2) of the faces, bordered by their neighbours' texels."""
+    # With the border, bilinear look-up has no seams.
     centres = (torch.arange(-1, resolution + 1, dtype=torch.float64) + 0.5) * (2 / resolution) - 1
     face = torch.arange(6)[:, None, None]
     inside = centres.clamp(-1, 1)

@@ -75,6 +75,7 @@ def _outward(splats: Splats) -> np.ndarray:
 
 def _geometry(splats: Splats) -> Tensor:
     """Collect the splats' positions, scaled axes, normals, opacities and sizes in a table (N, 17)."""
+    # Columns: position, two axes over their standard deviations, the plane's normal, the outward normal, opacity, mean standard deviation.
     u, v, normal = (axis.numpy() for axis in axes(torch.from_numpy(splats.rotations)))
     scales = np.maximum(splats.scales[:, :2], 1e-12)
     columns = [splats.positions, u / scales[:, :1], v / scales[:, 1:], normal, _outward(splats)]

@@ -99,6 +99,8 @@ def between(quick: Settings, standard: Settings, part: float) -> Settings:
 
 def _scheduled(settings: Settings, iterations: float, quick: Settings, standard: Settings) -> Settings:
     """Set the number of iterations, and adapt the schedule and the learning rates to it."""
+    # Each step adds noise, because it uses one view. Outside of the range from `quick` to `standard`, rates are multiplied by √(n /
+    # iterations), n the nearer of the two and the factor at most FASTEST, so that the noise of all steps together stays about the same.
     tables, part = settings.model_dump(), iterations / settings.train.iterations
     usual = min(max(iterations, quick.train.iterations), standard.train.iterations)
     for section, name in (("train", "iterations"), *SCHEDULE):

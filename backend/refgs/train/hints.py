@@ -67,6 +67,8 @@ def hinted_kinds(state: State, splats: np.ndarray, hints: list[Hint]) -> torch.T
 
 def _go_back(state: State) -> None:
     """Go back to an earlier iteration, and plan the rest within the time limit."""
+    # Without a time limit, AT_MOST minutes become the limit if the rest would take longer. With one, the total is chosen to fill what is
+    # left.
     count, pace, plan = (1 - AGAIN) * state.total, state.seconds / max(state.iteration, 1), state.plan
     state.seconds = plan.before = 0.0
     state.clock.resume({}, 0.0)

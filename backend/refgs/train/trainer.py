@@ -121,6 +121,7 @@ class Trainer:
 
     def _next_view(self) -> int:
         """Return the index of the next training view, in each epoch's random order."""
+        # The order depends on the seed and the epoch only, so that a resumed run has the same.
         epoch, place = divmod(self.state.iteration, len(self.state.views))
         if self._order[0] != epoch:
             generator = torch.Generator().manual_seed(self.state.settings.train.seed * 1_000_003 + epoch)

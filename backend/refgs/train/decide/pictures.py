@@ -70,6 +70,7 @@ def _specular(state: State, found: Found, views: list[int]) -> Iterator[tuple[Te
 
 def _reflections(state: State, found: Found, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
     """Render each view twice: self-reflections show the object's mean radiance, then the environment's light."""
+    # Only tracing would show what a mirror ray sees where it hits the object. These are two guesses.
     inputs = state.inputs()
     if inputs.occluder is None:
         return

@@ -31,6 +31,7 @@ def _redder(old: Explanation, size: float) -> Explanation:
 
 def _blurred(old: Explanation, size: float) -> Explanation:
     """Blend each texel of the environment with the mean around it, weighted by `size`."""
+    # The mean is over texels of the same face, up to a sixteenth of its side away.
     side = round((len(old[1]) // 6) ** 0.5)
     faces = old[1].view(6, side, side, 3).permute(0, 3, 1, 2)
     reach = max(1, side // 16)

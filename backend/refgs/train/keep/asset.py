@@ -83,6 +83,8 @@ def _without_untraced(surfels: Surfels, state: State) -> Surfels:
 @torch.no_grad()
 def _with_relightable_albedo(surfels: Surfels, state: State) -> Surfels:
     """If the scene has a light, give the surfels both an albedo and SH colours."""
+    # Programs that light surfels use the albedo, programs that only display them the SH colours. Whichever was not learned is computed from
+    # the other by the irradiance; metals take the learned reflectance.
     environment = state.environment()
     if environment is None:
         return surfels

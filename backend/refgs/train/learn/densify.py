@@ -146,6 +146,7 @@ def fewer_surfels(state: State) -> None:
 
 def _divide(learned: Learned, first: Tensor, second: Tensor) -> None:
     """Turn each surfel's two copies, in rows `first` and `second` (D,), into its halves."""
+    # The copies are moved apart and shortened along the surfel's longer axis, so that together they cover what it did.
     scale = learned["scale"][first]
     longer = scale.argmax(dim=1)
     rows = torch.arange(len(first), device=first.device)

@@ -226,6 +226,7 @@ def _with_axes(state: State, normals: Maps) -> Maps:
 
 def _near_outline(photo: Photo) -> Tensor:
     """Tell which pixels (H, W) lie just inside the outline of a photo's mask."""
+    # The visual hull has the surface's normals there. Farther inside it may not: over a bowl, the hull has a lid.
     if photo.mask is None:
         return torch.zeros(photo.image.shape[:2], dtype=torch.bool, device=photo.image.device)
     shown = (photo.mask > 127).float()[None]
@@ -264,5 +265,6 @@ def _counts(rendering: Rendering, photo: Photo) -> Tensor:
 
 def _saturating(error: Tensor, half: float, counts: Tensor, photo: Photo) -> Tensor:
     """Compute Σ counts · error / (error + half) per pixel of the whole photo."""
+    # Wrong priors have a limited effect: an error of `half` gives 1/2, a much larger one nearly 1.
     rows, columns = photo.whole or photo.image.shape[:2]
     return (counts * error / (error + half)).sum() / (rows * columns)
