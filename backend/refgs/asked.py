@@ -50,12 +50,12 @@ class Asked:
 
     @property
     def planned(self) -> bool:
-        """Return True if all settings are chosen to fit into `minutes`. A run that is continued with hints keeps its settings instead."""
+        """Return True if all settings are chosen to fit into `minutes`."""
         return self.preset is None and self.minutes is not None and self.hints is None
 
     @property
     def preset_name(self) -> str:
-        """Return the preset as run.toml records it: its name, or the time that all settings are chosen for, such as "5 minutes"."""
+        """Return the preset's name for run.toml, or the time limit, such as "5 minutes"."""
         return f"{self.minutes:g} minutes" if self.planned else self.preset or "standard"
 
     @cached_property
@@ -70,7 +70,7 @@ class Asked:
         return preset_settings(preset or self.preset or "standard", self._assignments)
 
     def resumed(self) -> "Asked":
-        """Return a copy that asks to resume this training. Its settings and hints are left out: the run folder has them."""
+        """Return a copy that asks to resume this training, without settings and hints."""
         return replace(self, changes=(), resume=True, run=None, hints=None)
 
     def words(self) -> list[str]:

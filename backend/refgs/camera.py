@@ -25,7 +25,7 @@ class Camera:
 
     @cached_property
     def camera_to_world(self) -> np.ndarray:
-        """Return the rigid 4×4 matrix from camera to world. Its columns are the camera's right, down and forward axes, and its position."""
+        """Return the 4×4 camera-to-world matrix: axes right, down and forward, then the position."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         matrix = np.eye(4)
         matrix[:3, :3] = rotation.T
@@ -64,11 +64,11 @@ class Camera:
         )
 
     def cropped(self, left: int, top: int, width: int, height: int) -> "Camera":
-        """Return the camera for a crop of its image: `width` × `height` pixels from column `left` and row `top`."""
+        """Return the camera for a crop of its image, given in pixels."""
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
     def turned(self) -> "Camera":
-        """Return the camera for its image turned clockwise by a quarter turn. It stands in the same place, rolled by 90°."""
+        """Return the camera for its image turned clockwise by a quarter turn."""
         roll = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
         return replace(
             self,
@@ -82,7 +82,7 @@ class Camera:
         )
 
     def fitted(self, max_side: int) -> "Camera":
-        """Return the camera for its image scaled down to at most `max_side` pixels on the longer side. A smaller image is left as it is."""
+        """Return the camera for its image, scaled down until no side exceeds `max_side` pixels."""
         scale = max_side / max(self.width, self.height)
         if scale >= 1:
             return self

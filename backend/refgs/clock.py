@@ -33,17 +33,14 @@ class Clock:
         self._events: list[tuple[str, torch.cuda.Event, torch.cuda.Event]] = []
 
     def resume(self, seconds: dict[str, float], processor: float) -> None:
-        """Continue from the times in the checkpoint of an interrupted training.
-
-        `seconds`, by part, are added to those measured so far. `processor` replaces the CPU time measured so far.
-        """
+        """Add a checkpoint's `seconds` by part, and continue from its CPU time `processor`."""
         self.processor = processor
         for name, value in seconds.items():
             self._add(name, value)
 
     @contextmanager
     def iteration(self, number: int) -> Iterator[None]:
-        """Measure the parts in this `with` block, which is one iteration. On a GPU, only one in `SAMPLED` iterations is measured."""
+        """Measure one iteration in a `with` block, on a GPU only every SAMPLED-th one."""
         global _watching
         if self._on_card and number % SAMPLED != SAMPLED // 2:
             yield
@@ -94,14 +91,14 @@ class Clock:
 
 
 def _event() -> torch.cuda.Event:
-    """Put an event into the GPU's queue, and return it. The GPU records the time when it reaches the event."""
+    """Put an event into the GPU's queue to record the time, and return it."""
     event = torch.cuda.Event(enable_timing=True)
     event.record()
     return event
 
 
 def timed(name: str) -> Callable:
-    """Return a decorator that times a function, or the forward and backward of an autograd Function, as the part `name`."""
+    """Return a decorator that times a function or autograd Function as the part `name`."""
 
     def decorate(what):
         if isinstance(what, type):

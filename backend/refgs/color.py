@@ -61,15 +61,12 @@ def primaries_to_rec709(chromaticities: Sequence[float]) -> np.ndarray:
 
 
 def pcs_to_rec709() -> np.ndarray:
-    """Return the matrix (3, 3) from XYZ of ICC profiles, whose white is D50, to linear Rec.709."""
+    """Return the matrix (3, 3) from ICC profiles' XYZ (D50) to linear Rec.709."""
     return np.linalg.inv(_to_pcs(REC709))
 
 
 def _to_pcs(chromaticities: Sequence[float]) -> np.ndarray:
-    """Return the matrix (3, 3) from linear RGB to XYZ, adapted to the white D50 (Bradford's adaptation).
-
-    `chromaticities` are x and y of the primaries red, green and blue, and of white.
-    """
+    """Return the matrix (3, 3) from linear RGB to XYZ adapted to D50."""
     x, y = np.reshape(np.asarray(chromaticities, np.float64), (4, 2)).T
     xyz = np.stack([x / y, np.ones(4), (1 - x - y) / y])  # red, green, blue, white, each of luminance 1
     primaries, white = xyz[:, :3], xyz[:, 3]

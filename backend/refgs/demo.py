@@ -80,11 +80,7 @@ def _check_blender(root: Path) -> None:
 
 
 def _child(root: Path, what: str, module: str, *arguments: object) -> None:
-    """Start a child process that runs a Python module which uses Blender, and wait for its end.
-
-    The module prints its progress as JSON lines, and a progress bar with the label `what` shows it. Raises InputError with the module's
-    last line if it exits with status 2.
-    """
+    """Run a Python module in a child process, with a progress bar. Raises InputError."""
     command = [sys.executable, "-m", module, *map(str, arguments)]
     with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
         with (
@@ -107,10 +103,7 @@ def _child(root: Path, what: str, module: str, *arguments: object) -> None:
 
 
 def _compare(folder: Path, truth: Path, previews: Path) -> None:
-    """Compare the preview images from Eevee with the images that Cycles rendered under the same light. Write the results to metrics.json.
-
-    Also copy the previews to the run's folder `pictures`, for the report.
-    """
+    """Compare previews with Cycles' images, add the metrics, and copy the previews for the report."""
     result: dict[str, dict[str, dict[str, float]]] = {}
     pictures = folder / "pictures" / "relight"
     for hdri in HDRIS:

@@ -39,10 +39,7 @@ class Effective:
         return cls(asked, asked)
 
     def changed(self, key: str, value: Any, by: By, why: str) -> "Effective":
-        """Return a copy in which one setting has a new value. Its `key` is "section.name".
-
-        The copy records what caused the change, `by`, and the reason in words, `why`.
-        """
+        """Return a copy with `value` for `key`, "section.name", recording `by` and `why` it changed."""
         section, name = key.split(".")
         table = getattr(self.settings, section).model_copy(update={name: value})
         return self.moved_to(self.settings.model_copy(update={section: table}), by, why)
@@ -55,20 +52,17 @@ class Effective:
         return replace(self, changes=self.changes | {key: Change(_by_key(self.asked)[key], value, by, why)})
 
     def moved_to(self, settings: Settings, by: By, why: str) -> "Effective":
-        """Return a copy that uses other settings, and records a change for each setting that differs.
-
-        `by` says what caused the changes, and `why` explains them in words.
-        """
+        """Return a copy with other settings that records each difference with `by` and `why`."""
         asked, before, after = (_by_key(s) for s in (self.asked, self.settings, settings))
         changes = {key: Change(asked[key], value, by, why) for key, value in after.items() if value != before[key]}
         return replace(self, settings=settings, changes=self.changes | changes)
 
     def chosen(self) -> dict[str, str]:
-        """Return the settings that were chosen from the photos, as {key: "value: reason"}. This is the table [chosen] of run.toml."""
+        """Return the settings chosen from the photos as {key: "value: reason"} for run.toml's [chosen]."""
         return {key: f"{change.became}: {change.why}" for key, change in self.changes.items() if change.by == "photos"}
 
     def rows(self) -> dict[str, dict[str, Any]]:
-        """Return all changed settings by key, each with the user's value, the new value and the reason: the table [changed] of run.toml."""
+        """Return all changes by key, as in the table [changed] of run.toml."""
         return {key: asdict(change) for key, change in self.changes.items()}
 
 

@@ -10,7 +10,7 @@ _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def one_line(message: object) -> str:
-    """Return a message as one line that every terminal can print. Characters that cannot be printed, such as newlines, are escaped."""
+    """Return a message as one printable line, with unprintable characters such as newlines escaped."""
     return _UNPRINTABLE.sub(lambda found: repr(found[0])[1:-1], str(message))
 
 
@@ -38,9 +38,9 @@ class NoCameras(InputError):
 
 
 class InputWarning(UserWarning):
-    """Warning that part of the user's input was wrong and was ignored. The message is one line, as for InputError."""
+    """Report in one line that part of the user's input was wrong and ignored."""
 
 
 def reason(error: Exception) -> str:
-    """Return the message of another library's error, cut short for quoting. If it is empty, return the name of the error's type."""
+    """Return a library error's message, cut short, or the error's type if empty."""
     return " ".join(str(error).split())[:120] or type(error).__name__

@@ -91,10 +91,7 @@ class RunLock:
 
 
 def remove_stale_lock(folder: Path) -> None:
-    """Remove the lock file and the half-written files that a killed process left in a folder.
-
-    Does nothing if another process has locked the folder.
-    """
+    """Remove a killed process's lock and half-written files, unless another process holds the lock."""
     if (folder / LOCK).exists():
         with suppress(TryAgain), RunLock(folder):
             pass

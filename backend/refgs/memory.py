@@ -16,10 +16,7 @@ LESS = "close other programs, or ask for less: smaller photos, fewer surfels, sm
 
 
 def trim() -> None:
-    """Return freed memory to the system. On systems other than Linux, do nothing.
-
-    When thousands of tensors have been freed, Linux's C library glibc may still keep gigabytes for later.
-    """
+    """Return freed memory to the system, on Linux only."""
     if sys.platform == "linux":
         release = getattr(ctypes.CDLL(None), "malloc_trim", None)  # absent in musl
         if release is not None:
@@ -27,14 +24,14 @@ def trim() -> None:
 
 
 def is_shortage(error: BaseException) -> bool:
-    """Return True if an error of Python, a library or the system's loader says that the main memory is full."""
+    """Return True if an error says that the main memory is full."""
     said = isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
     return said or any(words in str(error) for words in _SHORTAGES)
 
 
 @contextmanager
 def shortage_named(lower: str = LESS) -> Iterator[None]:
-    """Raise TryAgain if a `with` block runs out of main memory. `lower` is the advice that ends the message."""
+    """Raise TryAgain, ending with the advice `lower`, if a `with` block exhausts memory."""
     try:
         yield
     except Exception as error:
@@ -45,10 +42,7 @@ def shortage_named(lower: str = LESS) -> Iterator[None]:
 
 
 def check_limit() -> None:
-    """Raise TryAgain if the system limits the memory of this process (`ulimit -v`) to less than LEAST bytes.
-
-    With less, libraries crash or hang without an error message.
-    """
+    """Raise TryAgain if `ulimit -v` leaves this process less than LEAST bytes of memory."""
     if 0 <= (limit := _limit()) < LEAST:
         least = f"{LEAST / 1e9:.0f} GB, most of it for libraries"
         raise TryAgain(

@@ -71,10 +71,7 @@ def whole(path: str | os.PathLike, durable: bool = True) -> Iterator[Path]:
 
 
 def _replace(source: Path, target: Path) -> None:
-    """Rename the file `source` to `target`, replacing a file of that name.
-
-    Windows refuses this while a program has `target` open, so it is tried for about a second.
-    """
+    """Rename `source` to `target`, retrying while Windows refuses to replace it."""
     for pause in PAUSES:
         try:
             return os.replace(source, target)
@@ -84,10 +81,7 @@ def _replace(source: Path, target: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files of `whole` that killed processes left in a folder and the folders in it.
-
-    Call this only while no other process writes there.
-    """
+    """Remove killed processes' temporary files of `whole` below a folder that nobody writes to."""
     for file in folder.rglob("*.tmp"):
         if is_leftover(file):
             with suppress(OSError):
@@ -108,7 +102,7 @@ def _sync(path: Path, flags: int) -> None:
 
 
 def write_text(file: Path, text: str, durable: bool = True) -> None:
-    """Write a UTF-8 text file completely or not at all. With `durable`, it outlives a power failure (see `whole`)."""
+    """Write a UTF-8 text file completely or not at all (see `whole`)."""
     with whole(file, durable) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -174,7 +168,7 @@ def hash_file(file: Path, kind: Callable = hashlib.blake2b) -> "hashlib._Hash":
 
 
 def read_bytes(file: Path) -> bytes:
-    """Read a file. Raises OSError if `open_file` raises it, or if the file has more than LARGEST bytes."""
+    """Read a file. Raises OSError if it cannot be opened or exceeds LARGEST bytes."""
     with open_file(file) as opened:
         data = opened.read(LARGEST + 1)
     if len(data) > LARGEST:
@@ -219,17 +213,14 @@ def check_room(folder: Path) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise InputError if the folder of a capture does not exist, or if its path is not Unicode."""
+    """Raise InputError if a capture's folder is missing or its path is not Unicode."""
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder. Name the folder that holds the capture.")
     check_unicode(folder)
 
 
 def check_unicode(path: Path) -> None:
-    """Raise InputError if a path is not Unicode.
-
-    Most systems allow names of files that are not Unicode, but JSON, TOML and HTML cannot hold such a name.
-    """
+    """Raise InputError if a path is not Unicode."""
     try:
         str(path.resolve()).encode()
     except UnicodeEncodeError:
@@ -237,16 +228,13 @@ def check_unicode(path: Path) -> None:
 
 
 def command_line(*words: object) -> str:
-    """Return a command that the user can type, with its words quoted where the shell needs it."""
+    """Return a command quoted for the user's shell."""
     join = subprocess.list2cmdline if sys.platform == "win32" else shlex.join
     return join([str(word) for word in words])
 
 
 def clone_environment() -> dict[str, str]:
-    """Return environment variables that let a Python process import modules from its current folder.
-
-    Use it for processes that are started in the root of the repository.
-    """
+    """Return environment variables that let Python import modules from its current folder."""
     return os.environ | {"PYTHONSAFEPATH": ""}
 
 

@@ -60,7 +60,7 @@ def open_streams() -> Output:
 
 
 def _dropping(stream: Any) -> tuple[io.TextIOWrapper, Output]:
-    """Replace a text stream by one that drops what cannot be written. Returns the new stream, and the `Output` that it writes to."""
+    """Replace a text stream by one that drops unwritable text; return it and its `Output`."""
     encoding, lines = stream.encoding, stream.line_buffering or stream.write_through
     binary = stream.detach()
     output = Output(binary.detach() if isinstance(binary, io.BufferedWriter) else binary)
@@ -68,7 +68,7 @@ def _dropping(stream: Any) -> tuple[io.TextIOWrapper, Output]:
 
 
 def check_current_folder() -> None:
-    """Raise InputError if the current folder was deleted. Many libraries ask for its path, and fail without it."""
+    """Raise InputError if the current folder was deleted."""
     try:
         os.getcwd()
     except OSError:
@@ -78,10 +78,7 @@ def check_current_folder() -> None:
 
 
 def check_arguments() -> None:
-    """Raise InputError if a command-line argument is not Unicode, or cannot be decoded because the system's encoding is ASCII.
-
-    Many libraries cannot open a file with such a name.
-    """
+    """Raise InputError if a command-line argument is not Unicode or cannot be decoded."""
     for word in sys.argv[1:]:
         try:
             word.encode()

@@ -69,7 +69,7 @@ class Run:
         return [c.fitted(side) for c, split in zip(self.cameras, self.splits, strict=True) if split == "train"]
 
     def light(self, panorama: np.ndarray) -> Environment:
-        """Make a light to pass to `render` from an equirectangular image (H, W, 3) of linear radiance."""
+        """Make a light for `render` from an equirectangular image (H, W, 3) of linear radiance."""
         return light_of(panorama, self.settings)
 
     def relit(self, light: Environment, progress: Progress = lambda done, total: None) -> Surfels:

@@ -37,10 +37,7 @@ def check_free(folder: Path) -> None:
 
 
 def clear(folder: Path) -> None:
-    """Remove the files of a training that was killed before its first checkpoint. Reduced photos stay: the next training uses them.
-
-    Raises InputError if the folder holds anything else.
-    """
+    """Remove a training killed before its first checkpoint. Raises InputError for anything else."""
     check_free(folder)
     for name in reversed((*_BEFORE, *_AFTER)):  # killed here, it leaves what is free again
         if (folder / name).is_dir():
@@ -50,7 +47,7 @@ def clear(folder: Path) -> None:
 
 
 def _nothing_learned(folder: Path) -> bool:
-    """Return True if a folder holds nothing but files of a training that was killed before its first checkpoint."""
+    """Return True if a folder holds only a training killed before its first checkpoint."""
     own, checkpoints = {*_KEPT}, folder / CHECKPOINTS
     if checkpoints.is_dir():
         own |= {*_BEFORE}
@@ -62,10 +59,7 @@ def _nothing_learned(folder: Path) -> bool:
 
 
 def check_finished(folder: Path) -> tuple[Trained, Settings]:
-    """Raise InputError if the folder is no run folder, or if its training has not ended.
-
-    Otherwise return what `read_run_facts` returns: the table [run] and the settings.
-    """
+    """Return run.toml's facts and settings. Raises InputError if the training has not ended."""
     facts, settings = read_run_facts(folder)
     if not (folder / SPLATS).exists():
         again = f"refgs train … {command_line('--out', folder, '--resume')}"
@@ -74,10 +68,7 @@ def check_finished(folder: Path) -> tuple[Trained, Settings]:
 
 
 def read_run_facts(folder: Path) -> tuple[Trained, Settings]:
-    """Read run.toml. Return its table [run], and the settings of the training.
-
-    Raises InputError if there is no run.toml, or if a newer release has written it.
-    """
+    """Return run.toml's table [run] and settings. Raises InputError if it cannot be used."""
     found = _read_run(folder)
     return found.run, recorded_settings(found.settings, str(folder / "run.toml"))
 
@@ -124,7 +115,7 @@ def _release(version: str) -> tuple[int, ...]:
 
 
 def update_metrics(folder: Path, facts: dict[str, Any]) -> None:
-    """Merge results into a run's metrics.json. A new value replaces the old value of the same name, also in nested dicts."""
+    """Merge results into a run's metrics.json, where new values replace old ones."""
 
     def merged(known: dict, new: dict) -> dict:
         both = {key: merged(known[key], new[key]) for key in new if isinstance(known.get(key), dict)}

@@ -79,7 +79,7 @@ class Train(_Command):
     hints: str | None = None
 
     def asked(self) -> Asked:
-        """Return the command's options as an `Asked`. Raises InputError if they are wrong or do not fit together."""
+        """Return the command's options. Raises InputError if they are wrong or do not fit."""
         run, hints = (Path(path) if path else None for path in (self.run, self.hints))
         changes = tuple(self.settings)
         return Asked(
@@ -131,14 +131,14 @@ CLOSED = None  # queued in place of a command: the input has ended
 
 @dataclass
 class Refused:
-    """Line of the input that is not a valid command. `job` is the name of the job that it asks for, or None. `what` says what is wrong."""
+    """Hold why an input line is no valid command (`what`), and its `job`, if known."""
 
     job: str | None
     what: str
 
 
 def read_command(line: bytes) -> _Command | Refused:
-    """Parse a line of the input. Returns its command, or a `Refused` that says why it is no valid command."""
+    """Parse a line of the input to its command, or to a `Refused`."""
     job = None
     try:
         message = json.loads(line.decode())  # pydantic's parser refuses lone surrogates: names of folders hold them
@@ -196,10 +196,7 @@ class Worker:
         self._commands.put(CLOSED)
 
     def interrupt(self, *_) -> None:
-        """Handle SIGTERM and SIGINT. A training stops after the current iteration, with a checkpoint. Other jobs stop at once.
-
-        No half-written results are left.
-        """
+        """Handle SIGTERM and SIGINT: a training ends with a checkpoint, other jobs at once."""
         self._keep = False
         self.close()
         if not self._attentive:
@@ -295,10 +292,7 @@ class Worker:
         return "done", facts | {"psnr": quality, "left_out": left_out}
 
     def _hear_training(self, event: str, facts: dict[str, Any]) -> None:
-        """Send an event of a training. While the training makes masks, also handle the commands that have come.
-
-        Once iterations have begun, `_attend` handles commands. Raises _Ended if a command, or the end of the input, ends the training.
-        """
+        """Send a training's event, and handle commands while it makes masks. Raises _Ended."""
         self.send(event, facts)
         while event == "progress" and "stage" in facts and not self._commands.empty():
             command = self._commands.get()
@@ -313,10 +307,7 @@ class Worker:
                 self._waiting.append(command)
 
     def _attend(self, state: State) -> bool:
-        """Handle commands that came during a training; called before each iteration. Return True if the training must stop.
-
-        While the training is paused, this call waits.
-        """
+        """Handle commands before an iteration, waiting while paused; return True to stop training."""
         paused = False
         while paused or not self._commands.empty():
             command = self._commands.get()
@@ -343,10 +334,7 @@ class Worker:
         return False
 
     def _preview(self, state: State) -> None:
-        """Write a preview, and send its paths. If it cannot be written, warn once, and let the training continue.
-
-        On Windows, for example, a file that another program has open cannot be replaced.
-        """
+        """Write and send a preview; warn once if it cannot be written."""
         try:
             self.send("preview", write_preview(state))
         except OSError as error:
@@ -399,7 +387,7 @@ class Worker:
 
 
 def work() -> None:
-    """Run the job protocol on stdin and stdout until the input ends. Other output of the program goes to stderr."""
+    """Run the job protocol on stdin and stdout; other output goes to stderr."""
     events = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     worker = Worker(events)

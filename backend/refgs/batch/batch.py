@@ -30,7 +30,7 @@ SETTLED = 10.0  # seconds without a change after which a new capture's files are
 
 @dataclass
 class _Run:
-    """Hold a training of the batch: its steps by name, and the outcomes of those that have ended."""
+    """Hold one training: its steps by name, and the outcomes of ended steps."""
 
     job: Job
     nodes: dict[str, Node]
@@ -44,10 +44,7 @@ class _Run:
 
     @property
     def failed(self) -> tuple[str, Outcome] | None:
-        """Return the name and outcome of the first failed step, or None.
-
-        A failure of the step `masks` is ignored, because the training can succeed without masks.
-        """
+        """Return the name and outcome of the first failed step except `masks`, or None."""
         bad = [(name, found) for name in self.nodes if (found := self.outcomes.get(name)) and found.status]
         return next((pair for pair in bad if pair[0] not in OPTIONAL), None)
 
@@ -65,10 +62,10 @@ class _Run:
 
 
 class Batch:
-    """Follow the trainings of a list, or of a folder of captures, from their first step to the page about all of them."""
+    """Train all captures of a list or folder, and write a page about them."""
 
     def __init__(self, source: Path, out: Path, ask: Ask, device: str, report: Report):
-        """Read and check the trainings that `source` lists. Raises InputError if something is wrong with them."""
+        """Read the trainings that `source` lists. Raises InputError if one is wrong."""
         self._source, self._out, self._ask, self._device, self._report = source, out.resolve(), ask, device, report
         self._runs: dict[str, _Run] = {}
         self._references: dict[Step, Any] = {}  # trainings of one capture share its first steps
@@ -136,13 +133,7 @@ class Batch:
         write_rows(self._out / LOGS / ROWS, [self._row(run) for run in self._runs.values()])
 
     def _submit(self, job: Job, engine: Engine, card: int | None) -> None:
-        """Hand the steps of a training to the engine.
-
-        Two kinds of steps are left out: steps that an earlier batch has done, and steps that another training of the same capture has
-        already handed over.
-
-        `card` is the memory of a CUDA card in bytes. If it is None, the training uses no card.
-        """
+        """Submit a training's new steps; `card` is a CUDA card's memory in bytes, or None."""
         run = _Run(job, {node.step.name: node for node in steps_of(job, self._out, self._device)})
         self._runs[job.name] = run
         settings = job.settings()
@@ -175,12 +166,12 @@ class Batch:
         self._report("ended", {"run": run.job.name, "what": f"{run.job.name}: {what}"})
 
     def _look(self, run: _Run) -> None:
-        """Update a run's `figures` (its metrics) and `picture` (its first held-out view as rendered) from the files in its folder."""
+        """Update a run's `figures` and `picture` from the files in its folder."""
         folder = self._out / run.job.name
         run.figures, run.picture = figures_of(folder), picture_of(folder)
 
     def _tell(self) -> None:
-        """Report how many runs have ended, and which steps run now. Write rows.json, but not more often than every WRITE_EVERY seconds."""
+        """Report the batch's progress, and write rows.json at most every WRITE_EVERY seconds."""
         working = []
         for run in self._runs.values():
             for name in run.working():
@@ -193,11 +184,7 @@ class Batch:
             self._write_rows()
 
     def _added(self) -> list[Job]:
-        """Read the list or folder of captures again, and return the trainings that were added to it.
-
-        A training is returned only when the files of its capture are complete (see `_settled`). If the list has an error, warn of it once
-        and return [].
-        """
+        """Return the added trainings with completely copied captures, or [] if the list is wrong."""
         self._looked = time.monotonic()
         try:
             jobs = read_jobs(self._source, self._out, self._ask)
@@ -245,7 +232,7 @@ def ready(
 
 
 def _progress(run: Path) -> tuple[int, int]:
-    """Return the present iteration of the training in the folder `run`, and its total of iterations. Both are 0 if they are not known."""
+    """Return a training's present iteration and total, both 0 if they are unknown."""
     try:
         facts = read_json(run / PROGRESS, Progress, "")
     except InputError:
@@ -254,7 +241,7 @@ def _progress(run: Path) -> tuple[int, int]:
 
 
 def _settled(capture: Path) -> bool:
-    """Tell whether a capture has been copied completely: none of its files has changed in the last SETTLED seconds."""
+    """Tell whether no file of a capture has changed in the last SETTLED seconds."""
     try:
         changed = max(path.stat().st_mtime for path in [capture, *capture.rglob("*")])
     except OSError:

@@ -54,10 +54,10 @@ def _facts(file: Path) -> tuple[int, int]:
 
 
 class Depot:
-    """Read and write files on the machine on which `refgs batch` runs, for steps on other machines. It is an actor of Ray."""
+    """Read and write files on the batch's machine for steps on other machines."""
 
     def __init__(self, mark: Path):
-        """Remember the path of the file `mark`. A machine on which this file exists shares the batch's folder with this machine."""
+        """Remember the file `mark`, by which machines tell whether they share the batch's folder."""
         self._mark, self._tickets = mark, Counter()
 
     def begin(self, roots: tuple[Path, ...]) -> tuple[Path, dict[Path, int]]:
@@ -73,7 +73,7 @@ class Depot:
         return list_files(root)
 
     def read(self, file: Path, start: int) -> bytes:
-        """Return PART bytes of a file, beginning at the byte `start`. Return fewer at the end of the file."""
+        """Return PART bytes of a file from the byte `start`, fewer at its end."""
         with open(file, "rb") as opened:
             opened.seek(start)
             return opened.read(PART)
@@ -88,10 +88,7 @@ class Depot:
         _write(root / name, map(_get, parts), time)
 
     def remove(self, root: Path, ticket: int, names: list[str]) -> None:
-        """Remove the originals of files that a step has removed. Raises TryAgain if `ticket`, which is from `begin`, is no longer valid.
-
-        `names` are their paths in the folder `root`.
-        """
+        """Remove the files `names` from `root`. Raises TryAgain if `ticket` is no longer valid."""
         self._check(root, ticket)
         for name in names:
             (root / name).unlink(missing_ok=True)
@@ -149,18 +146,12 @@ def remove_copies(roots: list[Path], mark: Path) -> None:
 
 
 def _mark(root: Path) -> Path:
-    """Return the path of the empty file that marks `root`, a file or folder on this machine, as a copy.
-
-    It lies beside `root` and not in it, because the contents of a folder belong to the step.
-    """
+    """Return the path of the empty file that marks `root` as a copy."""
     return root.with_name(f".{root.name}.refgs-copy")
 
 
 def _fetch(root: Path, depot: Any) -> Listing:
-    """Update the copy of a file or folder from its original. Returns the listing, which is then the same for both.
-
-    Raises InputError if this machine has other files at `root` that are not a copy.
-    """
+    """Fetch `root` and return its listing. Raises InputError if other files are there already."""
     there, here = _get(depot.listing.remote(root)), list_files(root)
     if not _mark(root).exists():
         if here and here == there:  # this folder is shared
@@ -196,13 +187,10 @@ def _write(file: Path, parts: Iterator[bytes], time: int) -> None:
 
 
 class _Back:
-    """Copy changed files in folders of this machine back to their originals, in a thread, until `end` is called.
-
-    Ray stops a step by interrupting the main thread. The copying thread is not interrupted, so that the last changes are copied, too.
-    """
+    """Copy changed files back to their originals in a thread, until `end` is called."""
 
     def __init__(self, folders: dict[Path, tuple[int, Listing]], depot: Any):
-        """Start the thread. `folders` maps each folder to its ticket (see `Depot.begin`) and the listing of its original."""
+        """Start the thread; `folders` maps each folder to its ticket and the original's listing."""
         self._folders, self._depot, self._error = folders, depot, None
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -250,10 +238,7 @@ class _Back:
 
 
 def _get(reference: Any) -> Any:
-    """Wait for the value of a Ray reference, and return it.
-
-    Raises the error that the remote call raised, or TryAgain if the batch's machine does not answer.
-    """
+    """Wait for the value of a Ray reference, raising the remote call's error or TryAgain."""
     import ray
     import ray.exceptions
 

@@ -50,13 +50,10 @@ ALONE = {  # for a Ray of this machine alone, which nobody else may use
 
 
 class Engine:
-    """Run steps by Ray. A step starts when the steps that it waits for have ended, and a machine has cores, memory and a GPU free."""
+    """Run each step by Ray when its earlier steps have ended and resources are free."""
 
     def __init__(self, ray: Any, cores: int):
-        """Read the cores, memory and CUDA cards of the machines of a running Ray. `cores` is the number of cores of each step.
-
-        Raises InputError if no machine lends cores to Ray.
-        """
+        """Use a running Ray, with `cores` per step. Raises InputError if it has none."""
         self._ray, self._depot = ray, None
         self._steps: dict[Any, Step] = {}
         self._roots: set[Path] = set()
@@ -71,7 +68,7 @@ class Engine:
         self.cards = int(max(node.get("GPU", 0) for node in nodes))
 
     def card_bytes(self) -> int:
-        """Return the memory of a CUDA card of the cluster, in bytes. If the cluster has several cards, Ray chooses one of them."""
+        """Return the memory of a CUDA card of the cluster, in bytes."""
         return self._ray.get(self._ray.remote(_card_bytes).options(num_gpus=0.01).remote())
 
     def submit(self, step: Step, memory: int, card: float, before: list[tuple[Any, bool]]) -> Any:
@@ -174,7 +171,7 @@ class Engine:
 
 
 def _on(node: str) -> Any:
-    """Return Ray's scheduling strategy for a task that must run on the machine with the node id `node`."""
+    """Return Ray's scheduling strategy for running a task on the node with this id."""
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     return NodeAffinitySchedulingStrategy(node, soft=False)
@@ -217,11 +214,7 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
 
 
 def _keep_ignoring(ray: Any) -> None:
-    """Make this process ignore SIGTERM until the end of Ray's shutdown.
-
-    The caller already ignores SIGTERM. But when Ray closes its log, it restores the default handler, which ends the process. This function
-    makes the process ignore SIGTERM again, just before Ray ends its own processes.
-    """
+    """Ignore SIGTERM until Ray's shutdown ends, although Ray restores the default handler."""
     node = ray._private.worker._global_node
     if node is None or threading.current_thread() is not threading.main_thread():
         return
@@ -236,11 +229,7 @@ def _keep_ignoring(ray: Any) -> None:
 
 @contextmanager
 def _signals(handler: Any) -> Iterator[None]:
-    """Let `handler` handle SIGINT and SIGTERM in a `with` block. After the block, restore the handlers from before it.
-
-    Use None for `handler` if the code in the block sets handlers itself, as Ray does for SIGTERM when it starts. Does nothing outside of
-    the main thread.
-    """
+    """Set the SIGINT and SIGTERM handlers for a `with` block; None only restores them afterwards."""
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
     before = {number: signal.getsignal(number) for number in numbers}
     try:
@@ -254,10 +243,7 @@ def _signals(handler: Any) -> Iterator[None]:
 
 
 def _make_folder() -> Path:
-    """Make a folder for Ray's sockets and logs, and have it removed at exit. Also remove the folders that killed batches have left.
-
-    Only this user can open it. Ray's own folder, in which Ray lets all users write, is inside it and therefore protected.
-    """
+    """Make a private folder for Ray until exit; remove folders that killed batches left."""
     parent = Path("/tmp" if os.name == "posix" else tempfile.gettempdir())  # names of sockets must be short
     for old in parent.glob(f"{FOLDERS}*"):
         with suppress(OSError, Timeout):
@@ -272,7 +258,7 @@ def _make_folder() -> Path:
 
 
 def _remove(folder: Path, lock: FileLock) -> None:
-    """Remove a batch's folder. Try for TIDY seconds, because Ray's processes may still write files in it while they end."""
+    """Remove a batch's folder, trying for TIDY seconds while Ray's processes end."""
     until = time.monotonic() + TIDY
     while (folder / RAY).exists() and time.monotonic() < until:
         shutil.rmtree(folder / RAY, ignore_errors=True)
@@ -282,22 +268,14 @@ def _remove(folder: Path, lock: FileLock) -> None:
 
 
 def _is_left(folder: Path) -> bool:
-    """Return True if a folder may be left from a killed batch.
-
-    Such a folder belongs to this user, is over NEW seconds old, and contains nothing but the lock file and Ray's folder. A younger folder
-    may belong to a batch that has not locked it yet. The caller tests the lock.
-    """
+    """Return True if a folder looks left by a killed batch; callers test its lock."""
     facts = folder.stat()
     own = not hasattr(os, "getuid") or facts.st_uid == os.getuid()
     return own and time.time() > facts.st_mtime + NEW and {file.name for file in folder.iterdir()} <= {LOCKED, RAY}
 
 
 def _import_ray(cluster: bool) -> Any:
-    """Set the environment variables that Ray reads on import. Then import Ray, and return the module.
-
-    If `cluster` is false, a new random token keeps others from using the Ray that starts on this machine. Raises InputError if Ray is
-    missing or has another version than VERSION.
-    """
+    """Set Ray's environment and import it. Raises InputError unless Ray VERSION is installed."""
     os.environ.update({name: value for name, value in ENVIRONMENT.items() if name not in os.environ})
     if not cluster:  # no token need be kept for it
         os.environ.update(ALONE | {"RAY_AUTH_TOKEN": secrets.token_hex(32)})
@@ -316,10 +294,7 @@ def _import_ray(cluster: bool) -> Any:
 
 
 class _NoPaths(list):
-    """List of folders from which Ray's workers import modules. It stays empty, even when Ray adds folders to it.
-
-    Ray would add the current folder. If captures lie there, Python files among them could be imported by mistake.
-    """
+    """Keep empty the list of folders from which Ray's workers import modules."""
 
     def extend(self, _: Any) -> None:
         pass

@@ -14,7 +14,7 @@ OPTIONAL = ("masks",)  # steps whose failure counts only if the training fails, 
 
 
 class Node(NamedTuple):
-    """Hold a step and the names of the steps that it waits for: those in `after` must succeed, those in `may_fail` need not."""
+    """Hold a step and the steps it waits for; those in `may_fail` may fail."""
 
     step: Step
     after: tuple[str, ...] = ()

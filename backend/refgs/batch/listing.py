@@ -70,7 +70,7 @@ class Job(NamedTuple):
     ask: Ask
 
     def settings(self) -> Settings:
-        """Load the settings of the training. If they will be chosen later to fit a time limit, load the preset `standard`."""
+        """Load the training's settings, or the preset `standard` if they will be chosen later."""
         return load_settings(self.ask.preset or "standard", self.ask.set)
 
 
@@ -103,10 +103,7 @@ def _jobs_of_folder(source: Path, out: Path, ask: Ask) -> Iterator[Job]:
 
 
 def _jobs_of_list(file: Path, ask: Ask, above: tuple[Path, ...]) -> Iterator[Job]:
-    """Make the trainings of a list and of the lists that it includes. `above` are the lists that include it.
-
-    Folders in a list are relative to the folder of that list. `ask` holds the options that apply where the list has none.
-    """
+    """Yield the trainings of a list and of the lists that it includes."""
     file = Path(os.path.realpath(file))
     if file in above:
         raise InputError(f"{above[-1]} includes {file}, which includes it: take one of them out")
@@ -126,17 +123,14 @@ def _jobs_of_list(file: Path, ask: Ask, above: tuple[Path, ...]) -> Iterator[Job
 
 
 def _beside(file: Path, name: str) -> Path:
-    """Return the absolute path of the file or folder `name` in a list. The name is relative to the folder of the list `file`."""
+    """Return the absolute path of `name`, which is relative to the folder of `file`."""
     if "\0" in name:
         raise InputError(f"{file}: {name!r} is no path: correct the list")
     return Path(os.path.realpath(file.parent / name))  # and not Path.resolve, which raises for names that are too long
 
 
 def _check_unique(source: Path, out: Path, jobs: list[Job]) -> None:
-    """Raise InputError if a run's name cannot be a folder's name, if a capture is listed twice, or if two trainings share a run folder.
-
-    The message names `source`, the list or folder of captures. `out` is the folder of all runs.
-    """
+    """Raise InputError for invalid names, captures listed twice, and run folders used twice."""
     names: dict[Path, str] = {}
     runs: dict[str, Job] = {}
     for job in jobs:

@@ -43,7 +43,7 @@ class Row(NamedTuple):
 
 
 def write_rows(file: Path, rows: list[Row]) -> None:
-    """Write the rows to `file` as JSON (see docs/batch.md), in place of an earlier file. A write that fails is ignored."""
+    """Write the rows to `file` as JSON (see docs/batch.md), ignoring a failed write."""
     facts = []
     for row in rows:
         figures = {key: row.figures[key] for key in SHOWN if key in row.figures}
@@ -53,7 +53,7 @@ def write_rows(file: Path, rows: list[Row]) -> None:
 
 
 def write_page(out: Path, rows: list[Row], seconds: float) -> None:
-    """Write the page `index.html` about runs in the folder `out`, in place of an earlier one. `seconds` is how long the batch took."""
+    """Write the page `index.html` into `out`, about a batch that took `seconds`."""
     columns = [quantity for quantity in HEADLINE if quantity.key in SHOWN]
     columns = [quantity for quantity in columns if any(quantity.key in row.figures for row in rows)]
     table = []
@@ -83,7 +83,7 @@ def write_page(out: Path, rows: list[Row], seconds: float) -> None:
 
 
 def figures_of(run: Path) -> dict[str, float]:
-    """Read a run's metrics as a flat dict. Return {} if the file is missing or damaged."""
+    """Return a run's metrics as a flat dict, {} if they cannot be read."""
     try:
         return dict(flatten(run_metrics(run)))
     except (OSError, ValueError, InputError):
@@ -91,12 +91,12 @@ def figures_of(run: Path) -> dict[str, float]:
 
 
 def picture_of(run: Path) -> Path | None:
-    """Find a picture of a run: its first held-out view as rendered. Return None if there is none."""
+    """Return the file of a run's first rendered held-out view, or None."""
     return min((run / "pictures" / "test" / "color").glob("*.png"), default=None)
 
 
 def _small(file: Path | None) -> str:
-    """Return a picture, reduced to SIDE pixels, as a data URL. Return "" if there is none."""
+    """Return a picture as a data URL of SIDE pixels, "" if there is none."""
     image = None if file is None else read_png(file, cv2.IMREAD_COLOR)
     if image is None:
         return ""

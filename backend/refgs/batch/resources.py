@@ -8,7 +8,7 @@ BASE, PER_PIXEL, PER_SURFEL = 0.85e9, 850.0, 5000.0  # bytes: libraries; of a ph
 
 
 def memory(settings: Settings) -> int:
-    """Estimate the peak memory of a training, in bytes. A training on a GPU also takes about this much of the card's memory."""
+    """Estimate a training's peak memory in bytes, both main memory and the card's."""
     return int(BASE + PER_PIXEL * settings.image.max_side**2 + PER_SURFEL * settings.surfels.budget)
 
 

@@ -55,11 +55,11 @@ class Outcome(NamedTuple):
 
 
 class TryLater(Exception):
-    """Report that a step may succeed if it is run again. Ray then runs it again, on any machine."""
+    """Report that a step may succeed if Ray runs it again."""
 
 
 def recorded(step: Step) -> Outcome | None:
-    """Return the outcome of a step that succeeded before with the same command, if its file `made` still exists. Else return None."""
+    """Return the outcome of the same step's earlier success, or None if it must run."""
     from refgs.formats.progress import Record
     from refgs.formats.validate import read_json
 
@@ -104,7 +104,7 @@ def run_step(step: Step, cores: int, pause: float, depot: Any, optional: tuple[b
 
 
 def _run_and_record(step: Step, cores: int) -> Outcome:
-    """Run the command of a step. Record its outcome only if a retry would not change it: a success, or a status in FAILED."""
+    """Run a step's command, and record its outcome unless a retry may change it."""
     begun, node = time.monotonic(), platform.node()
     step.log.parent.mkdir(parents=True, exist_ok=True)
     step.running.touch()
@@ -121,11 +121,7 @@ def _run_and_record(step: Step, cores: int) -> Outcome:
 
 
 def _call(step: Step, cores: int, log) -> tuple[int, str]:
-    """Run the command of a step. Return its exit status and its output.
-
-    The command ends when its input closes. This function closes the input if it is interrupted, and the operating system closes it if this
-    process is killed. So the command does not outlive this process.
-    """
+    """Run a step's command, which ends with this process; return exit status and output."""
     log.write(f"$ refgs {' '.join(step.words)}\n".encode())
     log.flush()
     start = log.tell()
@@ -151,10 +147,7 @@ def _call(step: Step, cores: int, log) -> tuple[int, str]:
 
 
 def _line(printed: str, status: int) -> str:
-    """Return why a command failed, in one line: the signal that killed it, else the last error that it printed, else its exit status.
-
-    Errors are the lines that begin with "refgs: ".
-    """
+    """Return in one line why a command failed: signal, last error, or exit status."""
     lines = [line.removeprefix("refgs: ") for line in printed.splitlines() if line.startswith("refgs: ")]
     if status < 0:
         return f"killed by signal {-status}"

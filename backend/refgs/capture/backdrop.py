@@ -34,7 +34,7 @@ GRAZING = 0.15  # sine of the angle to the plane, below which a photo's pixels s
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """Hold a plane: the points p with `normal` @ p = `distance`. `normal` (3,) is a unit vector that points to the object's side."""
+    """Hold the plane `normal` @ p = `distance`; its unit normal (3,) faces the object."""
 
     normal: np.ndarray
     distance: float
@@ -101,7 +101,7 @@ class Backdrop:
         self.to_world[3, 2] = 1
 
     def before(self, points: np.ndarray) -> np.ndarray:
-        """Mark the points (N, 3) that lie clearly in front of the plane, farther than ABOVE · `self.radius` from it, as bool (N,)."""
+        """Mark the points (N, 3) clearly in front of the plane, as bool (N,)."""
         return self.plane.height(points) > ABOVE * self.radius
 
     def learn(self, images: list[np.ndarray], cameras: list[Camera], hidden: list[np.ndarray]) -> None:
@@ -169,10 +169,7 @@ class Backdrop:
         return np.where(known, np.minimum(result, 1), np.where(meets, -odds, np.float32(np.nan)))
 
     def _pixels_on(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Find the texel at which each pixel's ray meets the plane.
-
-        Returns the texel's coordinates for `remap` (H, W, 2), and a mask (H, W): true where there is such a texel.
-        """
+        """Return each pixel's texel for `remap` (H, W, 2), and where there is one."""
         column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         ray = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones_like(row)], axis=-1)
         ray = ray @ camera.world_to_camera[:3, :3]
@@ -185,10 +182,7 @@ class Backdrop:
         return texel, meets
 
     def _texels_in(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Find the pixel that shows each texel. Returns pixel coordinates for `remap` (SIDE, SIDE, 2), and a mask (SIDE, SIDE).
-
-        The mask is false for texels outside the picture, and for those that are seen at too grazing an angle.
-        """
+        """Return each texel's pixel for `remap` (SIDE, SIDE, 2), and where it is usable."""
         column, row = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
         texel = np.stack([column, row, np.ones_like(row)], axis=-1)
         u, v, depth = np.moveaxis(texel @ (camera.projection @ self.to_world).T, -1, 0)
@@ -234,5 +228,5 @@ def _logarithm(image: np.ndarray) -> np.ndarray:
 
 
 def _lab(image: np.ndarray) -> np.ndarray:
-    """Convert RGB, float32 0..255, to Lab, float32. L is scaled to 0..255, as in 8-bit Lab; a and b are not scaled."""
+    """Convert RGB in 0..255 to Lab with L in 0..255, both float32."""
     return cv2.cvtColor(image / 255, cv2.COLOR_RGB2LAB) * np.array([2.55, 1, 1], np.float32)

@@ -18,7 +18,7 @@ class Box:
 
     @classmethod
     def of(cls, region: RegionSettings) -> "Box":
-        """Make a box from the settings' section [region]: centre, edge lengths, and rotation (XYZ Euler angles in degrees)."""
+        """Make a box from the settings' centre, edge lengths, and XYZ Euler angles in degrees."""
         from scipy.spatial.transform import Rotation  # slow to import, and few captures have a region
 
         turn = Rotation.from_euler("xyz", region.rotation, degrees=True).as_matrix()
@@ -27,7 +27,7 @@ class Box:
         return cls(matrix)
 
     def moved(self, to_frame: np.ndarray) -> "Box":
-        """Return the box in other world coordinates: p_new = to_frame @ p_old. `to_frame` is (4, 4)."""
+        """Return the box in new world coordinates p_new = to_frame @ p_old."""
         return Box(to_frame @ self.matrix)
 
     @property
@@ -36,7 +36,7 @@ class Box:
 
     @property
     def radius(self) -> float:
-        """Return half the length of the box's diagonal: the radius of the ball about the box."""
+        """Return half the length of the box's diagonal."""
         return float(np.linalg.norm(self.matrix[:3, :3]))
 
     def contains(self, points: np.ndarray) -> np.ndarray:

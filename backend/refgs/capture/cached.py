@@ -62,7 +62,7 @@ def reduced_views(views: list[LoadedView], factor: int, folder: Path) -> list[Lo
 
 
 def release_memory(views: list[LoadedView]) -> None:
-    """Free the memory of memory-mapped photos, on Linux only. Their next use reads the files again; changed pixels are lost."""
+    """Free the memory of memory-mapped photos on Linux; changed pixels are lost."""
     if not hasattr(mmap, "MADV_DONTNEED") or sys.platform != "linux":
         return
     for view in views:
@@ -77,7 +77,7 @@ def remove_cached(folder: Path) -> None:
 
 
 def _name(view: View, max_side: int) -> str:
-    """Return the name of a photo's files: a hash of all that its pixels depend on, except the code that loads them."""
+    """Return the name of a photo's files, a hash of what its pixels depend on."""
     camera, files = view.camera, []
     for path in (view.image_path, view.mask_path):
         if path is not None and path.exists():
@@ -88,7 +88,7 @@ def _name(view: View, max_side: int) -> str:
 
 
 def _read(camera: Camera, folder: Path, name: str) -> LoadedView | None:
-    """Memory-map the cache files of a photo with this camera. Return None if there are no such files, or if they are damaged."""
+    """Memory-map a photo's cache files. Return None if they are missing or damaged."""
     image = next(folder.glob(f"{name}.image.*.npy"), None)
     if image is None:
         return None
@@ -102,7 +102,7 @@ def _read(camera: Camera, folder: Path, name: str) -> LoadedView | None:
 
 
 def _mapped(file: Path, shape: tuple[int, ...], *kinds: type) -> np.ndarray:
-    """Memory-map an array of this shape, with a dtype in `kinds`. Raises an exception of any type if the file does not hold one."""
+    """Memory-map an array of `shape` and a dtype in `kinds`, or raise any exception."""
     check_file(file)
     values = np.asarray(np.load(file, mmap_mode="c"))  # not "r", as torch warns of arrays that it must not write
     if values.shape != shape or values.dtype not in kinds:
@@ -111,7 +111,7 @@ def _mapped(file: Path, shape: tuple[int, ...], *kinds: type) -> np.ndarray:
 
 
 def _cached(view: LoadedView, folder: Path, name: str) -> LoadedView:
-    """Write a photo's cache files, and return the photo memory-mapped from them. Return `view` itself if they cannot be written."""
+    """Return the photo memory-mapped from new cache files, or unchanged if writing fails."""
     try:
         _write(view, folder, name)
     except OSError:
@@ -120,7 +120,7 @@ def _cached(view: LoadedView, folder: Path, name: str) -> LoadedView:
 
 
 def _write(view: LoadedView, folder: Path, name: str) -> None:
-    """Write a photo's cache files. The image is written last: if it exists, the photo is complete. Raises OSError if the disk is full."""
+    """Write a photo's cache files, the image last. Raises OSError if the disk is full."""
     if shutil.disk_usage(folder).free < 2 * view.image.nbytes:
         raise OSError
     files = [(f"{name}.image.{view.white}.npy", view.image)]

@@ -106,10 +106,7 @@ def _is_inverted(inside: np.ndarray) -> bool:
 
 
 def _sharpness(image: np.ndarray, inside: np.ndarray) -> float:
-    """Measure how sharp an image is: the sum of its squared Laplacian divided by the sum of its squared gradient.
-
-    Only pixels inside the mask and away from its edge count. The result does not depend on contrast. It is 0 for a uniform image.
-    """
+    """Measure sharpness inside the mask, independent of contrast; a uniform image has 0."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     inside = cv2.erode(inside.astype(np.uint8), np.ones((7, 7), np.uint8), borderValue=(0,)) > 0
     across, down = (cv2.Sobel(grey, cv2.CV_32F, *axis, scale=1 / 8)[inside] for axis in ((1, 0), (0, 1)))
@@ -179,7 +176,7 @@ def _masks(capture: Capture, statistics: list[_Statistics]) -> str:
 
 
 def _priors(capture: Capture) -> list[str]:
-    """Return a line that counts the training photos with normals from other programs, and a line for depth. Omit a count of 0."""
+    """Return lines that count training photos with other programs' normals and depth."""
     lines = []
     for name, field in FOLDERS.items():
         if count := sum(getattr(view, field) is not None for view in capture.train_views):
@@ -188,11 +185,7 @@ def _priors(capture: Capture) -> list[str]:
 
 
 def _guessed_object(capture: Capture) -> list[str]:
-    """Return a list with one line of text: the box in which a training would look for the object.
-
-    A training looks for the object to make masks. Return [] if it would make no masks: if a photo has a mask, if the layout stores masks in
-    the photos, or if the cameras look outwards. Also return [] if the user has set a box.
-    """
+    """Return a line naming the guessed box of the object, [] if there is none."""
     if any(view.masked for view in capture.views) or capture.layout in Z_UP or capture.box is not None:
         return []
     from refgs.capture.masks import (  # imports scipy, which a wrong folder should not wait for

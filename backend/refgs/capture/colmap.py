@@ -77,7 +77,7 @@ _MODELS = (
 
 
 def _sorted(top: Path, pattern: str) -> list[Path]:
-    """Return the folders below `top` that match a glob pattern, sorted as numbers are: `sparse/2` before `sparse/10`."""
+    """Return the folders below `top` that match a glob pattern, in numeric order."""
     if pattern == ".":
         return [top]
     # A folder `colmap` with photos is a capture of its own, in a folder of captures.
@@ -88,16 +88,13 @@ def _sorted(top: Path, pattern: str) -> list[Path]:
 
 
 def _is_model(folder: Path, pattern: str) -> bool:
-    """Tell whether a folder, found by `pattern`, has a model: a file of cameras and a file of images.
-
-    If `pattern` begins with "sparse", one of the two files is enough. Reading the model then raises an error that names the missing file.
-    """
+    """Tell whether a folder has a model, even an incomplete one below `sparse`."""
     there = [any((folder / f"{name}.{end}").is_file() for end in ("bin", "txt")) for name in ("cameras", "images")]
     return any(there) if pattern.startswith("sparse") else all(there)
 
 
 def _registered(model: Path) -> int:
-    """Count the photos of a model. Return 0 if its file cannot be read, so that any other model is preferred."""
+    """Count a model's photos, 0 if they cannot be read."""
     try:
         return count_images(model_files(model)[1])
     except InputError:
@@ -132,10 +129,7 @@ def read_colmap(model: Model) -> tuple[list[View], np.ndarray | None, np.ndarray
 
 
 def _passed_over(model: Model, count: int) -> list[str]:
-    """Return a list with one line about the models that are not used, or [] if there is no other model than `model`.
-
-    `count` is the number of photos of `model`.
-    """
+    """Return one line about the unused models, where `model` has `count` photos, or []."""
     if not model.others:
         return []
     other, photos = model.others[0]
@@ -145,17 +139,13 @@ def _passed_over(model: Model, count: int) -> list[str]:
 
 
 def _find(photos: Files, name: str) -> Path | None:
-    """Find a photo by the name that the model gives it. Return None if it is missing.
-
-    If COLMAP was run on the folder above that of the photos, the name begins with a folder `images` or `input`. If no photo has the whole
-    name, this folder is dropped from it.
-    """
+    """Find a photo by the model's name for it. Return None if it is missing."""
     first, _, rest = name.replace("\\", "/").partition("/")
     return photos.find(name) or (photos.find(rest) if fold(first) in PHOTO_FOLDERS else None)
 
 
 def capture_root(folder: Path, layout: str) -> Path:
-    """Return the folder in which a capture's folder `masks` is. `folder` is the capture's folder, `layout` its layout, such as "colmap"."""
+    """Return the folder that holds a capture's `masks`, which depends on its `layout`."""
     model = find_model(folder) if layout == "colmap" else None
     return folder if model is None else model.root
 

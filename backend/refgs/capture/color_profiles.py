@@ -53,13 +53,13 @@ _ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06)  # primaries; its gamma is 563
 
 
 def _pq(codes: np.ndarray) -> np.ndarray:
-    """Decode PQ codes in 0..1 (SMPTE ST 2084) to radiance. Radiance 1 is 203 cd/m², the white of diffuse surfaces by ITU-R BT.2408."""
+    """Decode PQ codes in 0..1 (SMPTE ST 2084) to radiance, where 1 is 203 cd/m²."""
     root = codes ** (32 / 2523)
     return 10_000 / 203 * (np.maximum(root - 107 / 128, 0) / (2413 / 128 - 2392 / 128 * root)) ** (16384 / 2610)
 
 
 def _hlg(codes: np.ndarray) -> np.ndarray:
-    """Decode HLG codes in 0..1 (ITU-R BT.2100) to scene radiance. Code 0.75 has radiance 1, the white of diffuse surfaces by BT.2408."""
+    """Decode HLG codes in 0..1 (ITU-R BT.2100) to scene radiance, where code 0.75 gives 1."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
 
     def scene(codes):
@@ -104,7 +104,7 @@ class Profile:
 
     @cached_property
     def is_srgb(self) -> bool:
-        """Tell whether the profile is that of sRGB, or nearly so. Codes then need no conversion."""
+        """Tell whether the profile is nearly sRGB, so that codes need no conversion."""
         differences = srgb_encode(_table(self, 256)) - np.linspace(0, 1, 256)[:, None]
         return bool(np.abs(self.matrix - np.eye(3)).max() < SAME_MATRIX and np.abs(differences).max() < SAME_CODE / 255)
 
@@ -133,7 +133,7 @@ class Profile:
 
 @dataclass(frozen=True, eq=False)
 class LookUp:
-    """Hold a colour profile made of look-up tables, as for CMYK. LittleCMS applies it to 8-bit pictures of Pillow's mode `mode`."""
+    """Hold a table-based colour profile for 8-bit pictures of Pillow's mode `mode`, such as CMYK."""
 
     profile: ImageCms.ImageCmsProfile
     mode: str
@@ -161,10 +161,7 @@ def coded_profile(primaries: int, transfer: int, path: Path) -> Profile | None:
 
 
 def _usable(find: Callable[[], Found], path: Path) -> Found | None:
-    """Return the profile that `find()` returns, or None if that is sRGB.
-
-    If `find` raises Unusable, return None. An InputWarning then names the file `path`, once for each reason.
-    """
+    """Return what `find` returns, but None for sRGB and, with a warning, for Unusable."""
     try:
         found = find()
     except Unusable as error:
@@ -182,7 +179,7 @@ def _of_picture(picture: Image.Image, path: Path) -> Profile | LookUp | None:
 
 
 def _of_tags(picture: Image.Image, path: Path) -> Profile | None:
-    """Return the profile that a picture without an ICC profile declares by other tags, or None. Raises Unusable."""
+    """Return the profile of a picture's non-ICC tags, or None. Raises Unusable."""
     info = picture.info
     if picture.format == "PNG":
         if points := _png_code_points(path):
@@ -208,11 +205,7 @@ def _of_code_points(primaries: int, transfer: int) -> Profile:
 
 @lru_cache(32)
 def _of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Profile:
-    """Return the profile of a PNG's gAMA (`gamma`) and cHRM (`chromaticities`: x and y of white, red, green and blue).
-
-    A gamma of 0.45455 stands for sRGB's curve, because the PNG specification lets encoders write this number for sRGB. Without `gamma`, the
-    curve is sRGB's, too. Without `chromaticities`, the primaries are those of Rec.709. Raises Unusable.
-    """
+    """Return the profile of a PNG's gAMA and cHRM, sRGB's if None. Raises Unusable."""
     curve = srgb_decode if not gamma or abs(gamma - 0.45455) < 5e-5 else _power(1 / gamma)  # Adobe RGB has 0.45471
     white, primaries = (chromaticities[:2], chromaticities[2:]) if chromaticities else ((), ())
     try:
@@ -222,7 +215,7 @@ def _of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> 
 
 
 def _is_adobe_rgb(picture: Image.Image) -> bool:
-    """Tell whether a picture's EXIF says that the camera was set to Adobe RGB (DCF 2.0, 5.1). Not all such cameras embed a profile."""
+    """Tell whether a picture's EXIF says Adobe RGB (DCF 2.0, 5.1)."""
     try:
         exif = Image.Image.getexif(picture)
         return exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == "R03"
@@ -231,7 +224,7 @@ def _is_adobe_rgb(picture: Image.Image) -> bool:
 
 
 def _png_code_points(path: Path) -> tuple[int, int] | None:
-    """Return the code points (primaries, transfer) of a PNG's chunk cICP (PNG specification, 11.3.2.6), or None. Pillow skips it."""
+    """Return the code points (primaries, transfer) of a PNG's chunk cICP, or None."""
     with open_file(path) as file:
         for name, _ in png_chunks(file):
             if name == b"cICP":
@@ -243,10 +236,7 @@ def _png_code_points(path: Path) -> tuple[int, int] | None:
 
 
 def _avif_code_points(path: Path) -> tuple[int, int] | None:
-    """Return the code points (primaries, transfer) of an AVIF's primary item, or None. Pillow does not read them.
-
-    They are in the item's box colr (ISO/IEC 14496-12, 12.1.5).
-    """
+    """Return the code points (primaries, transfer) of an AVIF's primary item, or None."""
     try:
         meta = next(body for kind, body in _boxes(path.read_bytes()) if kind == b"meta")[4:]
         inside = dict(_boxes(meta))
@@ -263,7 +253,7 @@ def _avif_code_points(path: Path) -> tuple[int, int] | None:
 
 
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the type (4 bytes) and the contents of each box in `data` (ISO/IEC 14496-12, 4.2)."""
+    """Yield each box's type (4 bytes) and contents (ISO/IEC 14496-12, 4.2)."""
     at = 0
     while at + 8 <= len(data):
         size, kind, start = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8], at + 8
@@ -277,7 +267,7 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _associated(ipma: bytes, item: int) -> list[int]:
-    """Return the numbers, counted from 1, of the properties that belong to an item, by the box ipma (ISO/IEC 23008-12, 9.3.2)."""
+    """Return an item's property numbers, from 1, in the box ipma (ISO/IEC 23008-12, 9.3.2)."""
     version, wide, count, at = ipma[0], ipma[3] & 1, int.from_bytes(ipma[4:8], "big"), 8
     for _ in range(count):
         size = 2 if version < 1 else 4
@@ -291,7 +281,7 @@ def _associated(ipma: bytes, item: int) -> list[int]:
 
 
 def _of_icc(data: bytes) -> Profile | LookUp:
-    """Parse an ICC profile. Return a LookUp if it is made of tables, otherwise a Profile. Raises Unusable."""
+    """Parse an ICC profile to a LookUp if it is made of tables. Raises Unusable."""
     found = _parsed(data)
     if isinstance(found, str):
         raise Unusable(found)
@@ -330,7 +320,7 @@ def _parsed(data: bytes) -> Profile | LookUp | str:
 
 
 def _curve(tag: bytes) -> Curve:
-    """Return a curve of a profile: a gamma, a table (curv) or a formula (para). See ICC.1:2022, 10.6 and 10.18."""
+    """Return a profile's curve from a curv or para tag (ICC.1:2022, 10.6 and 10.18)."""
     kind = tag[:4]
     if kind == b"curv":
         count = struct.unpack_from(">I", tag, 8)[0]
@@ -354,7 +344,7 @@ def _curve(tag: bytes) -> Curve:
 
 
 def _check_mode(profile: Profile | LookUp, mode: str) -> None:
-    """Raise Unusable if a profile is not for pictures of this Pillow mode, such as "RGB"."""
+    """Raise Unusable if a profile is not for pictures of this Pillow mode."""
     if isinstance(profile, Profile) and profile.grey:
         if mode[0] not in "1LI":
             raise Unusable("it is for greyscale pictures")
@@ -364,7 +354,7 @@ def _check_mode(profile: Profile | LookUp, mode: str) -> None:
 
 @lru_cache(32)
 def _table(profile: Profile, size: int) -> np.ndarray:
-    """Apply the curves of a profile's three channels to the codes 0 to `size` − 1. Return the linear values, float32 (size, 3)."""
+    """Return the linear values, float32 (size, 3), of all codes below `size`."""
     codes = np.arange(size) / (size - 1)
     with np.errstate(all="ignore"):  # a broken profile's numbers
         values = np.stack([curve(codes) for curve in profile.curves], axis=1)

@@ -17,22 +17,19 @@ _HASHES = TypeAdapter(dict[str, str])
 
 
 def hash_files(folder: Path, files: list[Path]) -> dict[str, str]:
-    """Return the BLAKE2b hash of each file's contents, by its path relative to `folder`. Raises InputError if a file cannot be read."""
+    """Return the files' BLAKE2b hashes by paths relative to `folder`. Raises InputError."""
     named = {Path(os.path.relpath(file, folder)).as_posix(): file for file in files}
     with ThreadPoolExecutor() as threads:  # hashlib works outside of Python's lock
         return dict(zip(named, threads.map(_hash, named.values()), strict=True))
 
 
 def write_hashes(run: Path, hashes: dict[str, str]) -> None:
-    """Write the hashes of a capture's files into the folder of a run that is trained on it."""
+    """Write the hashes of a capture's files into a run's folder."""
     write_text(run / FILE, json.dumps(hashes, indent=1))
 
 
 def changed_files(run: Path, hashes: dict[str, str]) -> list[str]:
-    """Return the paths of the files whose hashes differ from those in a run's folder.
-
-    Return [] if the folder has no hashes, as in runs of earlier releases.
-    """
+    """Return the paths whose hashes differ from the run's, [] if it has none."""
     try:
         known = _HASHES.validate_json(read_bytes(run / FILE))
     except (OSError, ValidationError):

@@ -29,33 +29,29 @@ _MASK_WORDS = re.compile(r"(?:mask|alpha|matte)[-_. ](?P<after>.+)|(?P<before>.+
 
 
 def is_image(name: str) -> bool:
-    """Tell by its name whether a file is an image. Hidden files, such as the ._NAME.jpg that macOS writes, do not count."""
+    """Tell by its name whether a file is an image and not hidden."""
     return not name.startswith(".") and os.path.splitext(name)[1].lower() in _RANKS
 
 
 def fold(name: str) -> str:
-    """Return a name in the form in which names are compared: without letter case, in Unicode's form NFC (macOS writes NFD)."""
+    """Return a name for comparison: without letter case, in Unicode's form NFC."""
     return unicodedata.normalize("NFC", name).casefold()
 
 
 def without_suffix(name: str) -> str:
-    """Return a file name or path without its image suffix. Other endings stay: `render.0001` is returned unchanged."""
+    """Return a file name or path without its image suffix; other endings stay."""
     stem, suffix = os.path.splitext(name)
     return stem if suffix.lower() in _RANKS else name
 
 
 def without_mask_word(name: str) -> str:
-    """Remove the word for mask, if any, from a file name without suffix: `0001_mask` becomes `0001`, the name of its photo."""
+    """Remove the word for mask from a name without suffix: `0001_mask` becomes `0001`."""
     found = _MASK_WORDS.fullmatch(name)
     return name if found is None else found["after"] or found["before"]
 
 
 class _Listing(NamedTuple):
-    """Hold the names in a folder.
-
-    `files` and `folders` map a folded name (see `fold`) to all names in the folder that have this folded form. `stems` maps an image's
-    folded name without suffix to the names of all such images.
-    """
+    """Hold a folder's names by folded name; keys of `stems` have no image suffix."""
 
     files: dict[str, list[str]]
     stems: dict[str, list[str]]
@@ -89,14 +85,14 @@ class Files:
         return None
 
     def find_folder(self, *parts: str) -> Path | None:
-        """Return the folder at the path `parts` below the capture's folder, in any letter case. Return None if there is none."""
+        """Return the folder at `parts` below the capture's folder, ignoring case, or None."""
         if parts not in self._folders:
             above = self.find_folder(*parts[:-1])
             self._folders[parts] = None if above is None else self.folder_in(above, parts[-1])
         return self._folders[parts]
 
     def folder_in(self, above: Path, name: str) -> Path | None:
-        """Return the folder `name`, in any letter case, that is in the folder `above`. Return None if there is none."""
+        """Return the folder `name`, in any letter case, in `above`, or None."""
         names = self._list(above).folders.get(fold(name), [])
         return above / (name if name in names else min(names)) if names else None
 
@@ -105,20 +101,20 @@ class Files:
         return sorted(name for names in self._list(folder).files.values() for name in names if is_image(name))
 
     def all_images(self, folder: Path) -> Iterator[Path]:
-        """Yield the images in a folder, then those in its subfolders, sorted in each folder. Leave out hidden files and folders."""
+        """Yield a folder's images, then its subfolders', each sorted, without hidden ones."""
         yield from (folder / name for name in self.images(folder))
         for inner in self.folders(folder):
             yield from self.all_images(inner)
 
     def folders(self, folder: Path) -> list[Path]:
-        """List the folders in a folder, sorted. Leave out hidden folders, and the __MACOSX that macOS adds to archives."""
+        """List the folders in a folder, sorted, without hidden ones and __MACOSX."""
         names = sorted(name for names in self._list(folder).folders.values() for name in names)
         inner = [folder / name for name in names if not name.startswith((".", "__MACOSX"))]
         real = os.path.join(os.path.realpath(folder), "")
         return [path for path in inner if not real.startswith(os.path.join(os.path.realpath(path), ""))]  # no circles
 
     def masks_beside(self, folder: Path) -> dict[str, str]:
-        """Find masks that lie beside their photos, such as 0001_alpha.png. Returns {mask's name: photo's folded name without suffix}."""
+        """Map the names of masks beside photos to the photos' folded names without suffix."""
         stems, masks = self._list(folder).stems, {}
         for name in (name for names in stems.values() for name in names if is_image(name)):
             of = without_mask_word(without_suffix(name))
@@ -127,7 +123,7 @@ class Files:
         return masks
 
     def _places(self, name: str, homes: tuple[str, ...]) -> Iterator[tuple[Path, str]]:
-        """Yield the existing folders in which a file may be, each with the file's name there."""
+        """Yield each existing folder that may hold a file, with the file's name there."""
         text = name.replace("\\", "/")
         absolute = text.startswith("/") or re.match(r"[A-Za-z]:", text) is not None
         path = posixpath.normpath(text)
@@ -146,7 +142,7 @@ class Files:
                 yield folder, parts[-1]
 
     def _own(self, folder: Path) -> Path:
-        """Resolve the links in a folder's path. If it then lies in `self.folder`, return its path there, otherwise `folder` unchanged."""
+        """Resolve a folder's links if it then lies in `self.folder`, else return it unchanged."""
         if folder not in self._owned:
             real, top = os.path.realpath(folder), os.path.realpath(self.folder)
             inside = real == top or real.startswith(os.path.join(top, ""))
@@ -188,7 +184,7 @@ def _preference(name: str) -> tuple[int, str]:
 
 
 def photo_folder(files: Files) -> Path:
-    """Return the subfolder `images` or `input` if images are somewhere in it. If neither has images, return the capture's folder."""
+    """Return the subfolder `images` or `input` that has images, else the capture's folder."""
     for name in PHOTO_FOLDERS:
         folder = files.find_folder(name)
         if folder is not None and next(files.all_images(folder), None) is not None:
@@ -209,7 +205,7 @@ def find_photos(folder: Path) -> list[Path]:
 
 
 def photos_in(files: Files, folder: Path, deep: bool) -> list[Path]:
-    """List the photos in a folder, by the rules of `find_photos`. If `deep` is true, search subfolders, too, except folders of masks."""
+    """List a folder's photos, with `deep` also those in subfolders except folders of masks."""
     names, masks = files.images(folder), files.masks_beside(folder)
     pictures = {without_suffix(name) for name in names if name.lower().endswith(PICTURE_SUFFIXES)}
     found = [

@@ -98,11 +98,7 @@ def _hull_points(
 def _in_and_around(
     box: Box, near: np.ndarray, around: np.ndarray, count: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Choose at random some points of `near` (N, 3) that lie inside the box, and some of `around` (M, 3) that lie outside.
-
-    Returns their indices in `near` and in `around`, at most `count` together. At most the fraction AROUND of `count` lies outside. Raises
-    InputError if no point of `near` is inside the box.
-    """
+    """Choose indices of `near` inside the box and `around` outside, or raise InputError."""
     rng = np.random.default_rng(seed)
     inner, outer = np.flatnonzero(box.contains(near)), np.flatnonzero(~box.contains(around))
     if len(inner) == 0:
@@ -112,12 +108,12 @@ def _in_and_around(
 
 
 def _enough(points: np.ndarray, box: Box | None) -> bool:
-    """Tell whether there are at least 100 structure-from-motion points, in the box if there is one."""
+    """Tell whether at least 100 points are in the box, or anywhere without one."""
     return len(points if box is None else points[box.contains(points)]) >= 100
 
 
 def _thinned(points: np.ndarray, capture: Capture, count: int, seed: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Choose at random at most `count` of the `points` (N, 3). Returns the chosen points and their sRGB colours (None if unknown)."""
+    """Choose at most `count` points (N, 3) at random, with their sRGB colours or None."""
     colours, chosen = capture.point_colors, slice(None)
     if capture.box is not None:
         chosen = np.concatenate(_in_and_around(capture.box, points, points, count, seed))
@@ -127,11 +123,7 @@ def _thinned(points: np.ndarray, capture: Capture, count: int, seed: int) -> tup
 
 
 def _random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
-    """Place `count` points at random: evenly in the user's box. If there is no box, place them in the ball that the cameras look at.
-
-    In two cases, up to half of the points are placed farther out, for what is around the box or the ball: if there is a box, and if the
-    photos show a room or an open scene. The inverse distances of these points from the centre are uniform.
-    """
+    """Place random points in the box or ball, with some around it where needed."""
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -149,10 +141,7 @@ def _random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
 
 
 def _towards_cameras(positions: np.ndarray, views: list[LoadedView]) -> np.ndarray:
-    """Compute the unit vectors (N, 3) from each point to the nearest camera.
-
-    These vectors are used as normals, because a surface that a photo shows faces its camera.
-    """
+    """Return unit vectors (N, 3) from the points to their nearest cameras, used as normals."""
     cameras = np.stack([view.camera.position for view in views])
     towards = cameras[cKDTree(cameras).query(positions)[1]] - positions
     return towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)

@@ -87,7 +87,7 @@ class LoadedView:
 
     @property
     def encoded(self) -> np.ndarray:
-        """Return the sRGB-encoded photo as float32 (H, W, 3): 1 is white, and EXR and HDR photos may be brighter."""
+        """Return the sRGB-encoded photo, float32 (H, W, 3); 1 is white, HDR photos exceed it."""
         return self.image.astype(np.float32) / self.white
 
     @property
@@ -97,7 +97,7 @@ class LoadedView:
 
     @property
     def clipped(self) -> np.ndarray:
-        """Mark the clipped channels of the pixels, bool (H, W, 3). JPEG changes values a little, so nearly clipped channels count, too."""
+        """Mark the clipped or nearly clipped channels of all pixels, bool (H, W, 3)."""
         return self.image >= np.iinfo(self.image.dtype).max // 255 * 254
 
 
@@ -115,7 +115,7 @@ class Header(NamedTuple):
 
     @property
     def upright(self) -> tuple[int, int]:
-        """Return the width and height of the upright image, the size in which `read_image` returns it."""
+        """Return the width and height of the upright image, as `read_image` returns it."""
         return (self.height, self.width) if self.turns % 2 else (self.width, self.height)
 
 
@@ -202,7 +202,7 @@ def read_codes(path: Path, shrink: int = 1, is_data: bool = False) -> tuple[np.n
 
 
 def _exr_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Decode an EXR to 16-bit codes (H, W, 3) and alpha (H, W) uint8 or None. NaN becomes black."""
+    """Decode an EXR to 16-bit codes (H, W, 3) and alpha uint8 or None."""
     pixels = np.nan_to_num(read_exr(path))
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, axis=2)
@@ -297,7 +297,7 @@ def read_alpha(view: View) -> np.ndarray | None:
 
 
 def _file_mask(view: View, file: Path) -> np.ndarray:
-    """Read the mask (H, W) uint8 of a view from `file`. If its size is not the upright photo's, turn it as the photo's EXIF says."""
+    """Read a view's mask (H, W) uint8 from `file`, upright like the photo."""
     mask = read_mask(file, view.mask_below)
     if mask.shape != (view.camera.height, view.camera.width):
         mask = np.rot90(mask, -read_header(view.image_path).turns).copy()  # torch takes no negative strides
@@ -344,7 +344,7 @@ def _is_exr(path: Path) -> bool:
 
 
 def _divisor(shrink: int, width: int, height: int) -> int:
-    """Halve `shrink`, a power of two, until both `width` and `height` can be divided by it."""
+    """Halve `shrink`, a power of two, until it divides both sides."""
     while width % shrink or height % shrink:
         shrink //= 2
     return shrink
@@ -368,7 +368,7 @@ def _open(path: Path) -> ImageFile.ImageFile:
 
 
 def _turns(picture: Image.Image) -> int:
-    """Return the clockwise quarter turns that make an opened picture upright: 0 for TIFF and HEIC, which their decoders turn."""
+    """Return the clockwise quarter turns that make a decoded picture upright."""
     if picture.format in ("TIFF", "HEIF"):
         return 0
     try:
@@ -392,11 +392,7 @@ def _decoding(path: Path) -> Iterator[None]:
 
 
 def _decode(picture: Image.Image, path: Path, look_up: LookUp | None = None) -> Image.Image:
-    """Decode a picture to 8-bit RGB, RGBA or grey, or to CMYK if `look_up` converts from CMYK.
-
-    Pillow is used, because OpenCV does not detect a truncated file. Black-and-white and grey pictures keep one channel: a mask of 256
-    million pixels would take 2 GB in colour.
-    """
+    """Decode a picture to 8-bit RGB, RGBA, grey, or the mode of `look_up`."""
     with _decoding(path):
         if picture.mode.startswith("I;16"):
             values = np.asarray(picture, dtype=np.float64) / 257
@@ -415,10 +411,7 @@ def _decode(picture: Image.Image, path: Path, look_up: LookUp | None = None) -> 
 
 
 def _as_array(picture: Image.Image, look_up: LookUp | None) -> np.ndarray:
-    """Copy a picture to an RGB or RGBA array (H, W, 3 | 4) uint8, converted by `look_up` if that is given.
-
-    To save memory, the picture is copied in strips: Pillow makes a temporary copy of each strip.
-    """
+    """Copy a picture to uint8 (H, W, 3 | 4), converted by `look_up` if given."""
     mode = "RGBA" if picture.mode == "RGBA" else "RGB"
     pixels = np.empty((picture.height, picture.width, len(mode)), np.uint8)
     for top in range(0, picture.height, ROWS):
@@ -429,11 +422,7 @@ def _as_array(picture: Image.Image, look_up: LookUp | None) -> np.ndarray:
 
 
 def _decode_16_bit(picture: ImageFile.ImageFile, path: Path) -> np.ndarray | None:
-    """Decode a PNG or TIFF with 16 bits a channel, or a HEIC with more than 8, to RGB or RGBA uint16 (H, W, 3 | 4).
-
-    Return None for other pictures. OpenCV decodes the colours of PNG and TIFF, because Pillow keeps only their upper 8 bits. Pillow first
-    checks that the file is not truncated, which OpenCV does not.
-    """
+    """Decode a picture of over 8 bits to RGB or RGBA uint16, or return None."""
     if picture.format == "HEIF" and picture.info["bit_depth"] > 8:
         return _decode_heic(picture, path)
     tags = getattr(picture, "tag_v2", {})
@@ -465,7 +454,7 @@ def _decode_16_bit(picture: ImageFile.ImageFile, path: Path) -> np.ndarray | Non
 
 
 def _decode_heic(picture: ImageFile.ImageFile, path: Path) -> np.ndarray:
-    """Decode a HEIC with more than 8 bits a channel to RGB or RGBA uint16 (H, W, 3 | 4)."""
+    """Decode a HEIC of over 8 bits a channel to RGB or RGBA uint16."""
     with _decoding(path):
         heic = open_heif(path, convert_hdr_to_8bit=False, hdr_to_16bit=False)
         largest = (1 << picture.info["bit_depth"]) - 1
@@ -474,7 +463,7 @@ def _decode_heic(picture: ImageFile.ImageFile, path: Path) -> np.ndarray:
 
 
 def as_bytes(codes: np.ndarray, white: int) -> np.ndarray:
-    """Convert codes to 8 bits, clipped to white. `white` is the code of white in `codes`; uint8 codes stay as they are."""
+    """Convert codes to 8 bits, clipped at the code `white`; uint8 codes stay."""
     return (
         codes
         if codes.dtype == np.uint8

@@ -46,7 +46,7 @@ class Lens:
 
     @property
     def distorts(self) -> bool:
-        """Tell whether the lens differs from a pinhole. A fisheye lens does, even if all its coefficients are zero."""
+        """Tell whether the lens differs from a pinhole, as every fisheye lens does."""
         return any(self.coefficients) or any(map(np.any, np.subtract(self.distort(0.5, 0.25), (0.5, 0.25))))
 
     def distort(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -93,7 +93,7 @@ class Lens:
         return np.where(found, x, BEHIND * x_seen), np.where(found, y, BEHIND * y_seen)
 
     def turned(self, height: int) -> "Lens":
-        """Return the lens for its photo turned clockwise by a quarter turn. `height` is the photo's height before the turn, in pixels."""
+        """Return the lens for its photo, `height` pixels high, turned clockwise by 90°."""
         return replace(self, fx=self.fy, fy=self.fx, cx=height - self.cy, cy=self.cx, turns=(self.turns + 1) % 4)
 
     def pinhole(self, camera: Camera, where: str) -> Camera:
@@ -131,7 +131,7 @@ class Lens:
         return columns.astype(np.float32), rows.astype(np.float32)
 
     def resized(self, x: float, y: float) -> "Lens":
-        """Return the lens for its photo made `x` times as wide and `y` times as high."""
+        """Return the lens for its photo scaled by the factors `x` and `y`."""
         return replace(self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
 
@@ -168,7 +168,7 @@ def _brown(coefficients: tuple[float, ...], x: np.ndarray, y: np.ndarray) -> tup
 
 @lru_cache(maxsize=64)
 def _colmap_camera(model: str, coefficients: tuple[float, ...]) -> Any:
-    """Make pycolmap's camera of a model, with a focal length of 1 and the principal point at 0."""
+    """Make pycolmap's camera of focal length 1 and principal point 0."""
     import pycolmap  # slow to import, and few captures need it
 
     camera = pycolmap.Camera.create_from_model_name(0, model, 1.0, 0, 0)
@@ -178,11 +178,7 @@ def _colmap_camera(model: str, coefficients: tuple[float, ...]) -> Any:
 
 @lru_cache(maxsize=64)
 def _focal_factor(lens: Lens, width: int, height: int) -> float | None:
-    """Find the smallest factor for the focal lengths with which the undistorted photo has no black borders.
-
-    A larger factor zooms in, so that more pixels lie inside the distorted photo. The result is at least WIDEST, because the centre of a
-    fisheye photo would lose too much resolution otherwise. Return None if there are black borders even with a factor of 2.
-    """
+    """Return the least focal-length factor, from WIDEST to 2, without black borders, or None."""
     u, v = np.meshgrid(np.linspace(0, width, 65), np.linspace(0, height, 65))
 
     @np.errstate(over="ignore", invalid="ignore")

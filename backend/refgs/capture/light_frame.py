@@ -86,12 +86,7 @@ def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.nd
 
 
 def _visibility(camera: Camera, positions: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find out whether the camera's picture contains the points with these `indices`, and whether other points may hide them.
-
-    Returns two arrays with an entry for each of these points. The first tells whether the point is inside the picture. The second is how
-    far the point lies behind the nearest point at the same pixel or next to it: the difference of their depths, in world units. The nearest
-    point is searched among all `positions` (N, 3).
-    """
+    """Return which `indices` are in the picture, and their depths behind the foremost points."""
     pixels, depth = project(camera, positions)
     ahead = inside(camera, pixels, depth)
     limits = camera.height - 1, camera.width - 1
@@ -107,11 +102,7 @@ def _harmonics(directions: np.ndarray) -> np.ndarray:
 
 
 def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray, photos: np.ndarray) -> float:
-    """Return the mean squared error with which a linear model predicts photos that it was not fitted to (cross-validation).
-
-    The model explains each of the `values` (M,) as a linear function of `terms` (M, K), plus a constant for its point, plus a constant for
-    its photo. `points` (M,) and `photos` (M,) hold the index of each value's point and photo.
-    """
+    """Cross-validate over photos a linear model of `values` by `terms`; return the mean squared error."""
     total = count = 0
     for fold in range(FOLDS):
         known = photos % FOLDS != fold
@@ -133,9 +124,6 @@ def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray,
 
 
 def _means(values: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
-    """Average the rows of `values` (M, K) that belong to the same group. Returns (groups, K).
-
-    `group` (M,) holds the index of each row's group, and `groups` is the number of groups. Empty groups get zero.
-    """
+    """Average the rows of `values` (M, K) in each group; empty groups get zero."""
     sums = np.stack([np.bincount(group, column, groups) for column in values.T], axis=1)
     return sums / np.maximum(np.bincount(group, minlength=groups), 1)[:, None]

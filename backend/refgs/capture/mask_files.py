@@ -44,17 +44,14 @@ def find_masks(files: Files, photos: list[Path]) -> dict[Path, Path]:
 
 
 def mask_folders(files: Files, photos: list[Path]) -> list[Path]:
-    """List the folders in which masks of photos are looked for. Masks of the photos in `images_4` are first looked for in `masks_4`."""
+    """List the folders that may hold masks, such as `masks_4` first for `images_4`."""
     reduced = [match[0] for photo in photos[:1] if (match := re.search(r"_\d+$", photo.parent.name))]
     names = [f"{name}{end}" for end in (*reduced, "") for name in MASK_FOLDERS]
     return [folder for name in names if (folder := files.find_folder(name)) is not None]
 
 
 def _match(files: Files, folder: Path, root: Path, photos: list[Path]) -> dict[Path, Path]:
-    """Return the mask of each photo that has one in `folder`. If several masks fit, take the one whose name is most like the photo's.
-
-    `root` is the folder to which the photos' paths are relative.
-    """
+    """Map photos of `root` to their masks in `folder`, those with the most similar names."""
     # Masks by their names: without suffix; without the word "mask", too; without the photo's suffix, too.
     exact, worded, bare = {}, {}, {}
     for mask in files.all_images(folder):
@@ -82,6 +79,6 @@ def _match(files: Files, folder: Path, root: Path, photos: list[Path]) -> dict[P
 
 
 def _inner(root: Path, photo: Path) -> list[str]:
-    """Return two forms of a photo's path: relative to the folder `root`, and the same without its first folder, such as `images`."""
+    """Return a photo's path relative to `root`, with and without its first folder."""
     parts = photo.relative_to(root).parts if photo.is_relative_to(root) else photo.parts[-1:]
     return ["/".join(some) for some in (parts, parts[1:]) if some]

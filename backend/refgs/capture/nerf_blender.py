@@ -21,10 +21,7 @@ from refgs.formats.transforms import read_transforms
 
 
 def read_nerf_blender(folder: Path) -> tuple[list[View], list[str]]:
-    """Read the training and test views (photos with cameras) of a NeRF-Blender capture, and warnings. Raises InputError.
-
-    Cameras are in the capture's coordinates.
-    """
+    """Read a NeRF-Blender capture's views in its own coordinates, and warnings. Raises InputError."""
     views, warnings = _read(folder / "transforms_train.json", "train")
     for name in ("transforms_test.json", "transforms_val.json"):
         if (folder / name).is_file():

@@ -24,7 +24,7 @@ FAR = 14.5 / 15  # part of a depth map's range at which the background begins
 
 
 def read_nero(folder: Path) -> tuple[list[View], list[str]]:
-    """Read a NeRO capture. Return its views (photos with cameras) in NeRO's coordinates, and warnings. Raises InputError."""
+    """Read a NeRO capture's views in its own coordinates, and warnings. Raises InputError."""
     names = (file.name.removesuffix("-camera.pkl") for file in folder.glob("*-camera.pkl"))
     numbers = sorted(int(name) for name in names if name.isdecimal())
     files = Files(folder)
@@ -58,10 +58,7 @@ def _camera(file: Path, name: str, width: int, height: int) -> Camera:
 
 
 def _test_numbers(folder: Path, numbers: list[int]) -> tuple[set[int], list[str]]:
-    """Return the numbers of the test views, and warnings.
-
-    They are read from NeRO's split file. If it is missing, every eighth view is a test view, and there is a warning.
-    """
+    """Return the test views by NeRO's split file, or every eighth with a warning."""
     file = next((path for path in (folder / SPLIT, folder.parent / SPLIT) if path.is_file()), None)
     if file is None:
         warning = f"{SPLIT} of NeRO is neither in the scene's folder nor beside it: every eighth view is tested on"

@@ -40,12 +40,7 @@ def not_used(capture: Capture) -> list[str]:
 
 
 def _without_camera(capture: Capture, files: Files) -> list[Path]:
-    """List the photos without a camera, from the folders that hold photos with cameras.
-
-    If photos with cameras are somewhere below the folder `images` or `input`, all of that folder is searched. A picture is left out if it
-    belongs to a photo with a camera: it is in the same folder, and its name begins with the photo's name. Such pictures are RAW files,
-    normals, depth and the like.
-    """
+    """List the photos without a camera, except pictures that belong to one with a camera."""
     used = {view.image_path for view in capture.views}
     stems = {(photo.parent, fold(without_suffix(photo.name))) for photo in used}
     folders = {photo.parent for photo in used}

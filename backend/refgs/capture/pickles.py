@@ -21,7 +21,7 @@ KINDS = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 
 
 def read_pair(file: Path) -> tuple[np.ndarray | list[int | str], np.ndarray | list[int | str]]:
-    """Read a pickle that holds two arrays or lists, and return both. Raise InputError with a message of one line for anything else."""
+    """Read a pickle of two arrays or lists. Raises InputError for anything else."""
     try:
         with open_file(file) as source:
             data = source.read(LARGEST + 1)
@@ -44,7 +44,7 @@ class _Refused(Exception):
 
 
 class _Dtype:
-    """Replace numpy.dtype while a pickle is read. `kind` is a type code such as "f8"; `order` is the byte order."""
+    """Replace numpy.dtype while a pickle is read, keeping type code and byte order."""
 
     def __init__(self, kind: str, *_):
         self.kind, self.order = kind, "="
@@ -54,7 +54,7 @@ class _Dtype:
 
 
 class _Array:
-    """Replace numpy.ndarray while a pickle is read: keep shape, type and bytes. `numpy()` makes the array later."""
+    """Replace numpy.ndarray while a pickle is read, until `numpy()` makes the array."""
 
     def __setstate__(self, state: tuple):
         _, self.shape, self.dtype, fortran, self.data = state
@@ -100,10 +100,7 @@ _Step = Callable[[pickle.Unpickler], None]
 
 
 class _Arrays(pickle._Unpickler):
-    """Read a pickle with only the classes and functions in `_NAMES`.
-
-    The base class is the unpickler written in Python. In the one written in C, a file of a few bytes could reserve gigabytes of memory.
-    """
+    """Read a pickle with only `_NAMES`; C's unpickler would let files reserve gigabytes."""
 
     read: Callable[[int], bytes]  # `load` sets these two
     append: Callable[[object], None]

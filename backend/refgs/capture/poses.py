@@ -55,7 +55,7 @@ def split_similarity(matrix: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]
 
 
 def in_frame(camera: Camera, to_frame: np.ndarray) -> Camera:
-    """Move a camera to other world coordinates, p_new = to_frame @ p_old (a 4×4 similarity). The camera's image stays the same."""
+    """Move a camera to world coordinates p_new = to_frame @ p_old, a 4×4 similarity."""
     scale, rotation, translation = split_similarity(to_frame)
     old = camera.world_to_camera
     pose = np.eye(4)

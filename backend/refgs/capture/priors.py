@@ -55,11 +55,7 @@ def with_priors(views: list[View], root: Path) -> list[View]:
 
 
 def _find(views: list[View], root: Path, folder: Path) -> dict[View, Path]:
-    """Find the prior of each training view in `folder`. Return {view: file}, without views that have no prior.
-
-    If a view has several files, the one whose suffix comes first in SUFFIXES is taken. A prior's path may lack the first folder of its
-    photo's path: `0001.png` is for `images/0001.jpg`. A file is not used if its name fits two training photos, or only a held-out photo.
-    """
+    """Map training views to the files in `folder` that fit by name, if any."""
     named: dict[str, list[View]] = {}
     for view in sorted(views, key=lambda view: view.split != "train"):
         parts = view.image_path.relative_to(root).parts if view.image_path.is_relative_to(root) else ()
@@ -146,7 +142,7 @@ def _read(path: Path, channels: int) -> np.ndarray:
 
 
 def _read_array(path: Path, channels: int) -> np.ndarray:
-    """Read an array from a NumPy file as float32 (H, W, C). The file may also hold (C, H, W), or additional axes of length 1."""
+    """Read a NumPy file as float32 (H, W, C), also from (C, H, W)."""
     try:
         loaded = read_array(path, "Save it again.")
         values = loaded.astype(np.float32)
@@ -164,11 +160,7 @@ def _read_array(path: Path, channels: int) -> np.ndarray:
 
 
 def _fitted(path: Path, view: View, values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, Camera]:
-    """Reduce a prior to at most SIDE pixels on its longer side, and undistort it like its photo.
-
-    Returns the new values, a mask (H, W) of known pixels, and the photo's camera for this size. Raises InputError if the prior has another
-    aspect ratio than the photo.
-    """
+    """Reduce and undistort a prior; return values, known pixels and camera, or raise InputError."""
     height, width = known.shape
     camera = view.camera
     if abs(width / height * camera.height / camera.width - 1) > SHAPE:

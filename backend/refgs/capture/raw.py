@@ -37,10 +37,7 @@ _TURNS = {3: 2, 5: 3, 6: 1}  # clockwise quarter turns that make a photo upright
 
 
 def read_raw_header(path: Path) -> tuple[int, int, int]:
-    """Read a RAW photo's width and height as stored, in pixels, and the clockwise quarter turns that make it upright.
-
-    Raises InputError naming the file.
-    """
+    """Return a RAW photo's stored width and height and clockwise quarter turns. Raises InputError."""
     with _reading(path), rawpy.RawPy() as raw:
         raw.open_file(str(path))
         return raw.sizes.iwidth, raw.sizes.iheight, _TURNS.get(raw.sizes.flip, 0)
@@ -70,7 +67,7 @@ def read_raw(path: Path, half: bool = False) -> np.ndarray:
 
 
 def read_exif(path: Path) -> dict[int, Any]:
-    """Read a RAW photo's EXIF tags, from the file or from the preview in it. Raises an exception of any type if it has no EXIF."""
+    """Read a RAW photo's EXIF tags. Raises an exception of any type without EXIF."""
     exif = Image.Exif()
     try:
         with open_file(path) as file:

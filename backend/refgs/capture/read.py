@@ -36,10 +36,7 @@ from refgs.settings import RegionSettings
 
 
 def find_layout(folder: Path) -> str | None:
-    """Return the layout of a folder's camera files: "nerf-blender", "stanford-orb", "tensoir", "nerfstudio", "colmap" or "nero".
-
-    Return None if the folder has no camera files.
-    """
+    """Return the layout of a folder's camera files, such as "nerf-blender", or None."""
     if is_tensoir(folder):  # first, because copies of the data set have a transforms_train.json, too
         return "tensoir"
     if (folder / "transforms_train.json").is_file():
@@ -62,7 +59,7 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
 
 
 def read_files(folder: Path) -> CaptureFiles:
-    """Read the photos' cameras from a capture's folder, in the capture's own coordinates. Decodes no photo or mask. Raises InputError."""
+    """Read a capture's files, without decoding pixels, in its own coordinates. Raises InputError."""
     folder = Path(folder)
     layout = _check_layout(folder)
     views, points, colors, warnings = _read(folder, layout)
@@ -111,10 +108,7 @@ def to_run_frame(files: CaptureFiles, wanted: RegionSettings | None = None) -> C
 
 
 def _check_layout(folder: Path) -> str:
-    """Return the file layout of a capture's folder, such as "colmap". Raise InputError if the folder holds no capture.
-
-    The error is NoCameras if the folder holds photos without cameras.
-    """
+    """Return the folder's layout. Raises InputError without a capture, NoCameras for photos alone."""
     check_folder(folder)
     layout = find_layout(folder)
     if layout is not None:
@@ -138,11 +132,7 @@ def _check_layout(folder: Path) -> str:
 
 
 def _read(folder: Path, layout: str) -> tuple[list[View], np.ndarray | None, np.ndarray | None, list[str]]:
-    """Read a capture with the reader for its layout.
-
-    Return the views (photos with cameras), the structure-from-motion points and their colours, and warnings. Points and colours are None if
-    this layout has none.
-    """
+    """Read a capture's views, points, points' colours, and warnings, by its layout's reader."""
     match layout:
         case "nerf-blender":
             views, warnings = read_nerf_blender(folder)
@@ -169,7 +159,7 @@ def _check_photos(views: list[View]) -> None:
 
 
 def _shared_photos(views: list[View]) -> list[str]:
-    """Return a list with one warning if the same photos are both training and test views, otherwise an empty list."""
+    """Return a warning if photos are both training and test views, otherwise []."""
     tested, trained = ({view.image_path for view in views if view.split == split} for split in ("test", "train"))
     shared = tested & trained
     if not shared:
@@ -179,7 +169,7 @@ def _shared_photos(views: list[View]) -> list[str]:
 
 
 def _hold_out(views: list[View]) -> list[View]:
-    """Make every eighth view, sorted by path, a test view that is held out from training. If there are test views, change nothing."""
+    """Make every eighth view by path a test view, unless there are test views."""
     if any(view.split == "test" for view in views):
         return views
     views = sorted(views, key=lambda view: view.image_path.as_posix())
@@ -200,11 +190,7 @@ def _check_cameras(folder: Path, views: list[View]) -> None:
 
 
 def _unique_names(views: list[View]) -> list[View]:
-    """Make the cameras' names unique within each split ("train", "test").
-
-    If several photos have the same file name, the folder's path is put in front of their cameras' names. Raises InputError if names still
-    are not unique.
-    """
+    """Make cameras' names unique within each split by paths. Raises InputError if impossible."""
     names = Counter((view.split, view.camera.name) for view in views)
     # Absolute, because a camera file may give some photos by absolute paths.
     top = os.path.commonpath([os.path.abspath(view.image_path.parent) for view in views])
@@ -222,11 +208,7 @@ def _unique_names(views: list[View]) -> list[View]:
 
 
 def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.ndarray]], list[str]]:
-    """Choose some of the views that have masks, and reduce their masks to low resolution.
-
-    Return all views, a list of the pairs (view, reduced mask), and warnings. If the chosen masks are all white everywhere, they are
-    useless: then return the views without masks, an empty list of pairs, and a warning.
-    """
+    """Return the views, pairs of view and reduced mask, and warnings; drop white masks."""
     silhouettes = sample_silhouettes(views)
     if silhouettes or not any(view.masked for view in views):
         return views, silhouettes, []
@@ -235,11 +217,7 @@ def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.nda
 
 
 def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray, float]:
-    """Choose the run's frame: +Z is up, and the region of interest is a ball of radius 1 about the origin.
-
-    Return the similarity transform (4, 4) from the run's frame to the capture's, and its scale. A capture whose layout is in Z_UP (+Z is up
-    in its files) keeps its own coordinates, unless its region of interest is so far away, large or small that float32 is too inexact.
-    """
+    """Return the similarity (4, 4) from the run's frame to the capture's, and its scale."""
     if layout in Z_UP:
         if is_near(region):
             return np.eye(4), 1.0
@@ -248,16 +226,13 @@ def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray,
 
 
 def _narrow(whole: Region, box: Box, views: list[View], silhouettes: list) -> tuple[Region, float]:
-    """Reduce the region of interest to the part inside a box.
-
-    Return the new region, and the radius of a ball about its centre that contains the old region `whole`.
-    """
+    """Return the region within `box`, and the radius about its centre that contains `whole`."""
     region = region_in(box, views, silhouettes)
     return region, whole.radius + float(np.linalg.norm(whole.centre - region.centre))
 
 
 def _in_run_frame(capture: Capture, unit: float) -> Capture:
-    """Convert a capture's cameras, points and box to the run's coordinates. One unit of the run is `unit` units of the capture."""
+    """Convert a capture to the run's coordinates; one run unit is `unit` capture units."""
     to_run = np.linalg.inv(capture.to_capture)
     points = capture.points
     return replace(

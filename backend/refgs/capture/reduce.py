@@ -64,7 +64,7 @@ def reduced_map(values: np.ndarray, alpha: np.ndarray, camera: Camera) -> tuple[
 
 
 def encode(linear: np.ndarray, white: int) -> np.ndarray:
-    """Encode linear radiance to sRGB codes: 8-bit if `white`, the code of radiance 1, is 255, else 16-bit."""
+    """Encode linear radiance to sRGB, radiance 1 to `white`: 8-bit if 255, else 16-bit."""
     if white == 255:
         return np.rint(srgb_encode(np.clip(linear, 0, 1)) * 255).astype(np.uint8)
     bounded = np.clip(linear, 0, 1000)  # which is beyond every code
@@ -72,7 +72,7 @@ def encode(linear: np.ndarray, white: int) -> np.ndarray:
 
 
 def _linear(image: np.ndarray, alpha: np.ndarray | None, white: int, rows: slice) -> np.ndarray:
-    """Decode rows of a photo to linear radiance, float32 (R, W, 3). With alpha, return premultiplied RGBA (R, W, 4)."""
+    """Decode rows of a photo to linear radiance, float32, or premultiplied RGBA with alpha."""
     table = _decoding_table(np.iinfo(image.dtype).max, white)
     part = image[rows]
     linear = cv2.LUT(part, table) if part.dtype == np.uint8 else np.take(table, part)
@@ -88,7 +88,7 @@ def _linear(image: np.ndarray, alpha: np.ndarray | None, white: int, rows: slice
 def _undistorted(
     image: np.ndarray, alpha: np.ndarray | None, white: int, rows: slice, camera: Camera, lens: Lens
 ) -> np.ndarray:
-    """Return rows of the undistorted photo of the pinhole `camera`, in the form that `_linear` returns."""
+    """Return rows of the photo undistorted for the pinhole `camera`, as `_linear` does."""
     across, down = lens.maps(camera, rows)
     first = min(max(int(np.floor(down.min())), 0), len(image) - 1)
     last = min(max(int(np.floor(down.max())) + 1, first), len(image) - 1)
@@ -98,10 +98,7 @@ def _undistorted(
 
 
 def _area_weights(rows: slice, source: slice, ratio: float) -> np.ndarray:
-    """Return a matrix (R, S) that averages the S rows `source` of a photo over the areas of the reduced photo's R `rows`.
-
-    `ratio` is the photo's height divided by the reduced photo's.
-    """
+    """Return a matrix (R, S) that averages rows `source` to R rows, `ratio` times fewer."""
     edges = np.arange(rows.start, rows.stop + 1) * ratio
     row = np.arange(source.start, source.stop)
     shared = np.minimum(row + 1, edges[1:, None]) - np.maximum(row, edges[:-1, None])
@@ -111,5 +108,5 @@ def _area_weights(rows: slice, source: slice, ratio: float) -> np.ndarray:
 
 @cache
 def _decoding_table(largest: int, white: int) -> np.ndarray:
-    """Return the linear radiance, float32, of each sRGB code from 0 to `largest`. `white` is the code whose radiance is 1."""
+    """Return the linear radiance, float32, of sRGB codes to `largest`, where `white` has 1."""
     return srgb_decode(np.arange(largest + 1) / white).astype(np.float32)

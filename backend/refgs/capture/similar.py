@@ -46,10 +46,7 @@ def _unit(rows: np.ndarray) -> np.ndarray:
 
 
 def _describe(features: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Return the VLAD vector (WORDS · D,) of a photo, from its features (M, D) and all photos' `means` (WORDS, D).
-
-    The vector has length 1. It is zero if the photo has no features.
-    """
+    """Return a photo's VLAD vector (WORDS · D,) of length 1, zero without features."""
     word = np.argmax(features @ means.T - (means**2).sum(axis=1) / 2, axis=1)
     sums = np.zeros_like(means)
     np.add.at(sums, word, features - means[word])

@@ -22,7 +22,7 @@ NOVEL = "transforms_novel.json"
 
 
 def read_stanford_orb(folder: Path) -> tuple[list[View], list[str]]:
-    """Read the training and test views of a Stanford-ORB capture, in the capture's coordinates, and warnings. Raises InputError."""
+    """Read a Stanford-ORB capture's views in its own coordinates, and warnings. Raises InputError."""
     (trained, lost), (tested, more) = (_read(folder / f"transforms_{split}.json", split) for split in ("train", "test"))
     return trained + tested, lost + more
 

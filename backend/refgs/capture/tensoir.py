@@ -39,7 +39,7 @@ def is_tensoir(folder: Path) -> bool:
 
 
 def read_tensoir(folder: Path) -> tuple[list[View], list[str]]:
-    """Read a TensoIR capture. Return its training and test views, in the capture's coordinates, and warnings. Raises InputError."""
+    """Read a TensoIR capture's views in its own coordinates, and warnings. Raises InputError."""
     found = _folders(folder, "train") + _folders(folder, "test")
     named = [(pair, f"{pair[0].name}/{PHOTOS[0]}", _photo(pair[0])) for pair in found]
     photos, warnings = leave_out_missing(folder, named)
@@ -54,7 +54,7 @@ def _folders(folder: Path, split: Split) -> list[tuple[Path, Split]]:
 
 
 def light_folder(folder: Path) -> Path | None:
-    """Return the folder with the panoramas for the scene in `folder`. Return None if it is not there."""
+    """Return the folder of panoramas for the scene in `folder`, or None if missing."""
     tops = [top / "Environment_Maps" / size for top in folder.resolve().parents[:2] for size in _MAPS]
     return next((top for top in tops if any((top / f"{light}.hdr").is_file() for light in LIGHTS)), None)
 

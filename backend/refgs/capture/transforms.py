@@ -66,11 +66,7 @@ _UNDISTORT = "Undistort the photos to pinholes, and export their cameras again."
 
 
 def _lens_model(frame: Frame, where: str) -> tuple[str, tuple[float, ...]]:
-    """Return the name and the coefficients of a frame's lens model (see `Lens`).
-
-    Raises InputError if the model is not known, if the frame has a lens key that does not belong to the model, or if a coefficient is
-    missing or invalid.
-    """
+    """Return a frame's lens model and its coefficients (see `Lens`). Raises InputError."""
     word = (frame.camera_model or ("OPENCV_FISHEYE" if frame.is_fisheye else "OPENCV")).upper()
     if word not in _MODELS:
         raise InputError(f"{where}: camera_model is {frame.camera_model}, which is not known. {_UNDISTORT}")
@@ -96,7 +92,7 @@ _LARGEST = 1e9  # of a coefficient: those of r⁸ are large for long lenses
 
 
 def _says_perspective(value: object) -> bool:
-    """Tell whether a lens key that the program does not know can be ignored: its value is zero, empty, false, or a word for perspective."""
+    """Tell whether a lens key's value is zero, empty, or a word for perspective."""
     if isinstance(value, str):
         return value.upper() in ("", "NONE", *_PERSPECTIVE)
     if isinstance(value, list | dict):
@@ -126,15 +122,12 @@ def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> tuple[list[View
 
 
 def camera_name(path: str) -> str:
-    """Return the name of a frame's camera: the last part of its `file_path`, without an image suffix."""
+    """Return the camera's name: the last part of `path` without an image suffix."""
     return without_suffix(path.replace("\\", "/").rsplit("/", 1)[-1])
 
 
 def _focal(focal: float | None, angle: float | None, size: float) -> float | None:
-    """Return `focal`, a focal length in pixels. If it is None, compute it from the angle of view over `size` pixels, in radians.
-
-    Return None if neither is given, and NaN if the angle is not between 0 and π.
-    """
+    """Return `focal`, or compute it in pixels from the angle in radians, NaN if wrong."""
     if focal is not None or angle is None:
         return focal
     return size / 2 / math.tan(angle / 2) if 0 < angle < math.pi else math.nan
@@ -144,10 +137,7 @@ _CONVENTIONS = {"opengl": OPENGL_TO_OPENCV, "blender": OPENGL_TO_OPENCV, "opencv
 
 
 def _camera_to_world(frame: Frame, where: str) -> np.ndarray | None:
-    """Return a frame's camera-to-world matrix, converted to OpenCV's axes. Return None if a row does not have four numbers.
-
-    In the file, the axes are those that the key `camera_convention` names, or else OpenGL's. Raises InputError for an unknown name.
-    """
+    """Return a frame's camera-to-world matrix with OpenCV's axes, None if malformed. Raises InputError."""
     convention = frame.camera_convention or "opengl"
     if convention.lower() not in _CONVENTIONS:
         known = ", ".join(_CONVENTIONS)

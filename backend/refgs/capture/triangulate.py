@@ -53,7 +53,7 @@ def triangulate(views: list[View], progress: Callable[[int, int], None]) -> np.n
 
 
 def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
-    """Pair each camera with a few near cameras whose viewing directions differ by about ANGLE degrees. Returns pairs of indices."""
+    """Return index pairs of near cameras whose viewing directions differ by about ANGLE degrees."""
     position = np.array([camera.position for camera in cameras])
     forward = np.array([camera.world_to_camera[2, :3] for camera in cameras])
     angle = np.degrees(np.arccos(np.clip(forward @ forward.T, -1, 1)))

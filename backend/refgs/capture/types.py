@@ -50,7 +50,7 @@ class View:
 
 
 class CaptureFiles(NamedTuple):
-    """Hold what the files of a capture say, in the capture's own coordinates. Fields are those of `Capture`; `colors` is `point_colors`."""
+    """Hold what a capture's files say, in the capture's own coordinates (see `Capture`)."""
 
     folder: Path
     layout: str
@@ -109,7 +109,7 @@ class Capture:
 
     @cached_property
     def hashes(self) -> dict[str, str]:
-        """Hash the files that a training reads: photos, masks, and other programs' normals and depths. Keys are relative paths."""
+        """Return the hashes of all files that a training reads, by relative path."""
         files = [(v.image_path, v.mask_path, v.prior_normals, v.prior_depth) for v in self.views]
         return hash_files(self.folder, [path for paths in files for path in paths if path is not None])
 

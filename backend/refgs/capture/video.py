@@ -57,7 +57,7 @@ class _Film:
 
 @dataclass(eq=False)
 class _Candidate:
-    """Hold the sharpest frame of a stretch of time: its sharpness, a small grey picture (h, w) uint8, and its JPEG file."""
+    """Hold a stretch's sharpest frame: sharpness, grey picture (h, w) uint8, and JPEG file."""
 
     sharpness: float
     grey: np.ndarray
@@ -156,15 +156,12 @@ def _gradient(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _products(*pictures: np.ndarray) -> np.ndarray:
-    """Return the scalar products of every two pictures, as a matrix M.
-
-    A sum of the pictures with weights w then has the sum of squares w @ M @ w.
-    """
+    """Return the matrix of the scalar products of every two pictures."""
     return np.array([[np.vdot(one, other) for other in pictures] for one in pictures], np.float64)
 
 
 def _opened(video: Path) -> _Film:
-    """Open a video file. Raise InputError if it is not a video, or if its header is missing because it is truncated."""
+    """Open a video file. Raises InputError if it is no video or truncated."""
     path = os.path.abspath(video)  # FFmpeg takes what is before a colon for a protocol, but not in a path from the root
     try:
         check_file(video)
@@ -188,14 +185,14 @@ def _opened(video: Path) -> _Film:
 
 
 def _length(container: InputContainer, stream: VideoStream) -> float:
-    """Return the length of a video in seconds, 0 if the file does not say it."""
+    """Return a video's length in seconds, 0 if the file does not say it."""
     if stream.duration and stream.time_base:
         return float(stream.duration * stream.time_base)
     return (container.duration or 0) / av.time_base
 
 
 def _scanned_length(container: InputContainer, stream: int) -> float:
-    """Return the length of a stream in seconds by the times of all its packets. Return 0 if there are fewer than two."""
+    """Return a stream's length in seconds by its packets, 0 if there are too few."""
     times = [
         (float(packet.pts * packet.time_base), float((packet.duration or 0) * packet.time_base))
         for packet in container.demux(container.streams[stream])
@@ -205,7 +202,7 @@ def _scanned_length(container: InputContainer, stream: int) -> float:
 
 
 def _frames(film: _Film) -> Iterator[tuple[float, av.VideoFrame]]:
-    """Decode a video. Yield each frame with its time in seconds, from 0. Raise InputError where it is broken or truncated."""
+    """Yield each frame with its seconds from 0. Raises InputError where the video is broken."""
     video, stream, length = film.file, film.stream, film.length
     stream.thread_type = "AUTO"
     start, time, step = None, 0.0, float(1 / stream.average_rate) if stream.average_rate else 0.0
@@ -259,7 +256,7 @@ def _pulled(graph: av.filter.Graph) -> Iterator[av.VideoFrame]:
 
 
 def _display_matrix(frame: av.VideoFrame) -> tuple[int, int, int, int]:
-    """Return a frame's display matrix (a, b, c, d) without its translation, rounded to quarter turns: see `_Film`."""
+    """Return a frame's display matrix (see `_Film`), rounded to quarter turns."""
     data = frame.side_data.get("DISPLAYMATRIX")
     if data is None:
         return 1, 0, 0, 1
@@ -271,11 +268,7 @@ def _display_matrix(frame: av.VideoFrame) -> tuple[int, int, int, int]:
 
 
 def _sharpest(film: _Film, work: Path, count: int, report: Callable) -> tuple[int, list[_Candidate]]:
-    """Find the sharpest frame in each of `count` equal stretches of time, and write it to the folder `work`.
-
-    Stretches without frames are skipped. `report` is called as by `extract_photos`. Returns how many frames were read, and the candidates
-    in the order of time.
-    """
+    """Write each stretch's sharpest frame to `work`; return the frame count and the candidates."""
     length = film.length
     rate = float(film.stream.average_rate or 0)
     frames, candidates = 0, []
@@ -326,11 +319,7 @@ def _sharp(candidates: list[_Candidate]) -> list[_Candidate]:
 
 
 def _choose(video: Path, frames: int, candidates: list[_Candidate]) -> tuple[list[_Candidate], int, int]:
-    """Leave out blurred candidates and duplicates. A duplicate shows nearly the same picture as the last candidate that was kept.
-
-    Returns the candidates that are left, the number of blurred ones and the number of duplicates. Raises InputError if fewer than
-    MIN_PHOTOS are left. The error names `video` and the number of its `frames`.
-    """
+    """Drop blurred candidates and duplicates; return the rest and both counts, or raise InputError."""
     if len(candidates) < MIN_PHOTOS:
         raise InputError(f"{video}: too few frames in it ({frames}). {REFILM}.")
     sharp = _sharp(candidates)
@@ -346,7 +335,7 @@ def _choose(video: Path, frames: int, candidates: list[_Candidate]) -> tuple[lis
 
 
 def _grey(film: _Film, frame: av.VideoFrame, converter: VideoReformatter) -> np.ndarray:
-    """Return a frame as a grey picture (h, w) uint8, reduced to SIDE pixels on its longer side."""
+    """Return a frame as a grey picture (h, w) uint8 of at most SIDE pixels."""
     size = _square(film, frame)
     scale = min(1.0, SIDE / max(size))
     width, height = (max(1, round(side * scale)) for side in size)
@@ -354,12 +343,12 @@ def _grey(film: _Film, frame: av.VideoFrame, converter: VideoReformatter) -> np.
 
 
 def _square(film: _Film, frame: av.VideoFrame) -> tuple[int, int]:
-    """Return the width and height that a frame gets when its pixels are made square. Neither side becomes smaller."""
+    """Return a frame's width and height with square pixels, neither smaller than before."""
     return round(frame.width * max(film.aspect, 1)), round(frame.height * max(1 / film.aspect, 1))
 
 
 def _upright(film: _Film, frame: av.VideoFrame, converter: VideoReformatter) -> np.ndarray:
-    """Return a frame in full size as RGB (H, W, 3) uint8, sRGB-encoded, with square pixels, turned and mirrored as its metadata says."""
+    """Return a frame as upright sRGB-encoded RGB (H, W, 3) uint8 with square pixels."""
     # Players take the curves of other transfers for that of the screen, and so do we.
     transfer = frame.color_trc if frame.color_trc in HDR else ColorTrc.BT709
     profile = coded_profile(frame.color_primaries, transfer, film.file)

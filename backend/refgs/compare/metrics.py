@@ -42,7 +42,7 @@ def decibels(square: float) -> float:
 
 
 def psnr(image: np.ndarray, reference: np.ndarray) -> float:
-    """Compute the peak signal-to-noise ratio (PSNR) in dB of a picture, compared with the reference. Both are sRGB-encoded."""
+    """Compute the PSNR in dB of a picture and its reference, both sRGB-encoded."""
     return decibels(float(((np.asarray(image, np.float64) - reference) ** 2).mean()))
 
 
@@ -59,7 +59,7 @@ def fitted_exposure(radiance: np.ndarray, alpha: np.ndarray, photo: np.ndarray) 
 
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> float:
-    """Compute the structural similarity (SSIM) of two sRGB-encoded pictures, with a Gaussian window of σ 1.5 pixels (Wang et al. 2004)."""
+    """Compute SSIM (Wang et al. 2004, σ 1.5 pixels) of two sRGB-encoded pictures."""
     mean = structural_similarity(
         np.asarray(image, np.float64),
         np.asarray(reference, np.float64),
@@ -93,10 +93,7 @@ def specks(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def lpips_missing() -> str | None:
-    """Return None if LPIPS can be measured here. Otherwise name the missing package or file in one line.
-
-    The weights of LPIPS's network are never downloaded.
-    """
+    """Name in one line the package or file that LPIPS lacks, or return None."""
     missing = [name for name in ("lpips", "torchvision") if importlib.util.find_spec(name) is None]
     if missing:
         return f"the package {missing[0]} is not installed"
@@ -111,7 +108,7 @@ def _lpips_network():
 
 
 def lpips(image: np.ndarray, reference: np.ndarray) -> float:
-    """Compute the LPIPS error (Zhang et al. 2018) between two sRGB-encoded pictures, with VGG-16 and the linear layers of version 0.1."""
+    """Compute the LPIPS error (Zhang et al. 2018), with VGG-16, of two sRGB-encoded pictures."""
     pair = (torch.from_numpy(np.asarray(x, np.float32)).permute(2, 0, 1)[None] for x in (image, reference))
     with torch.no_grad():
         return float(_lpips_network()(*pair, normalize=True))
@@ -235,10 +232,7 @@ def environment_log_rmse(environment: np.ndarray, reference: np.ndarray) -> tupl
 
 
 def _blur(values: np.ndarray, degrees: float) -> np.ndarray:
-    """Blur one channel of a panorama (h, 2h) on the sphere. `degrees` is the standard deviation σ.
-
-    A pixel at the angle a has the weight exp((cos a − 1) / σ²): a Gaussian on the sphere.
-    """
+    """Blur a panorama (h, 2h) by a Gaussian on the sphere with σ of `degrees`."""
     elevation, turn = _elevations(len(values)), 2 * np.pi / values.shape[1] * np.arange(values.shape[1])
     up, out = np.sin(elevation), np.cos(elevation)
     cosine = up[:, None, None] * up[:, None] + out[:, None, None] * out[:, None] * np.cos(turn)

@@ -16,10 +16,7 @@ TOLD, DOUBTFUL = (0.33, 0.35, 0.38), (1.0, 0.6, 0.15)  # sRGB: where photos tell
 
 
 def composite(view: LoadedView, background: Tensor) -> Tensor:
-    """Composite a photo over a background colour (3,), both sRGB-encoded. Return floats (H, W, 3) in 0..1.
-
-    Values brighter than white are clipped. A photo without alpha is only clipped.
-    """
+    """Composite a photo over a background (3,), clipped to 0..1; both are sRGB-encoded."""
     image = torch.from_numpy(view.encoded).to(background.device).clamp_max(1)
     if view.alpha is None:
         return image
@@ -44,7 +41,7 @@ def maps(rendering: Rendering) -> dict[str, np.ndarray]:
 
 
 def color_picture(rendering: Rendering, background: np.ndarray) -> np.ndarray:
-    """Convert a rendering's colour to 8-bit sRGB-encoded RGBA with straight alpha. The `background` colour is subtracted first."""
+    """Convert a rendering's colour, without its `background`, to 8-bit sRGB RGBA with straight alpha."""
     alpha = rendering.alpha.numpy(force=True)[..., None]
     over = rendering.color.numpy(force=True) - background * (1 - alpha)
     return as_bytes(np.dstack([over / np.maximum(alpha, 1e-6), alpha]))
@@ -78,20 +75,17 @@ def picture(name: str, value: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def over_white(pixels: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """Composite premultiplied linear RGBA over white. Return sRGB-encoded floats (H, W, 3) in 0..1.
-
-    Radiance, but not alpha, is multiplied by `scale` first.
-    """
+    """Composite premultiplied linear RGBA over white as sRGB in 0..1, with radiance times `scale`."""
     return np.clip(srgb_encode(pixels[..., :3] * scale + 1 - pixels[..., 3:]), 0, 1)
 
 
 def as_bytes(value: np.ndarray) -> np.ndarray:
-    """Convert floats in 0..1 to 8-bit integers in 0..255. Values outside 0..1 are clipped; NaN becomes 0."""
+    """Convert floats, clipped to 0..1, to 8-bit integers; NaN becomes 0."""
     return np.rint(np.clip(np.nan_to_num(value), 0, 1) * 255).astype(np.uint8)
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write a uint8 picture (H, W), (H, W, 3) or (H, W, 4) as a PNG file. A failed write leaves no partial file."""
+    """Write a grey, RGB or RGBA uint8 picture as PNG, completely or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if pixels.ndim == 3:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR if pixels.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)

@@ -52,7 +52,7 @@ def whole_normal_mae_degrees(normals: np.ndarray, alpha: np.ndarray, true: np.nd
 
 
 def eroded(mask: np.ndarray) -> np.ndarray:
-    """Return the mask after Stanford-ORB's erosion by a square of 5×5 pixels, as bool (h, w)."""
+    """Return the mask (h, w) after Stanford-ORB's erosion by 5×5 pixels, as bool."""
     return cv2.erode(np.rint(mask * 255).astype(np.uint8), np.ones((5, 5), np.uint8)) > 127
 
 
@@ -89,7 +89,7 @@ def _psnr(image: np.ndarray, photo: np.ndarray, inside: np.ndarray) -> float:
 
 
 def _small_ssim(image: np.ndarray, reference: np.ndarray) -> float:
-    """Compute SSIM as kornia's `ssim_loss` with a window of 3 pixels does (Wang et al. 2004, Eq. 13)."""
+    """Compute SSIM like kornia's `ssim_loss` with a 3-pixel window (Wang et al. 2004, Eq. 13)."""
 
     def mean(x: np.ndarray) -> np.ndarray:
         return cv2.GaussianBlur(x, (3, 3), 1.5, borderType=cv2.BORDER_REFLECT_101)

@@ -57,10 +57,7 @@ class TensoIRTruth(GroundTruth):
         return cv2.resize(linear, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
     def _pixels(self, name: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Read the picture `name`.png of the camera's view. Return its pixels (H, W, 3) and its alpha (H, W), as float32 in 0..1.
-
-        Alpha is 1 if the file has none. The picture keeps its size. Raises InputError if it does not fit the view (see `check_size`).
-        """
+        """Read `name`.png of a view as float32 pixels and alpha in 0..1. Raises InputError."""
         file = self.folder / camera.name / f"{name}.png"
         pixels, alpha = read_image(file, is_data=True)
         check_size(file, pixels, camera)
@@ -99,7 +96,7 @@ class StanfordORBTruth(GroundTruth):
         return pixels
 
     def depth(self, camera: Camera) -> np.ndarray | None:
-        """Read the true depth (h, w) of the camera's view, in the capture's units. Return None if the data set has none."""
+        """Read a view's true depth (h, w) in the capture's units, or None."""
         file = self._file("z_depth", f"{camera.name}.npy")
         if not file.parent.is_dir():
             return None
@@ -108,10 +105,7 @@ class StanfordORBTruth(GroundTruth):
         return cv2.resize(depth.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
     def novel_views(self) -> list[View]:
-        """Return the views that show the same object in other scenes. Scenes without a file of their light are left out.
-
-        The views' cameras are in the training's coordinates.
-        """
+        """Return views in other scenes whose light is known, in the training's coordinates."""
         found = [view for scene, view in novel_views(self.folder) if (self._truths / scene / "env_map").is_dir()]
         return [replace(view, camera=in_frame(view.camera, self._to_run)) for view in found]
 
@@ -149,7 +143,7 @@ def truth_folder(folder: Path) -> Path:
 
 
 def _load(file: Path, channels: int) -> np.ndarray:
-    """Load an array from a .npy file: (H, W) if `channels` is 1, otherwise (H, W, channels). Raises InputError naming the file."""
+    """Load an array (H, W) or (H, W, channels) from a .npy file. Raises InputError."""
     try:
         pixels = read_array(file, "Download the data set again.")
     except FileNotFoundError:

@@ -44,7 +44,7 @@ class GroundTruth:
         self._find()
 
     def _find(self) -> None:
-        """Find which maps, lights and mesh the folder has. Raises InputError if it has none of them."""
+        """Find the folder's maps, lights and mesh. Raises InputError if it has none."""
         self.passes = [name for name in PASSES if (self.folder / name).is_dir()]
         relit = (self.folder / "relight").iterdir() if (self.folder / "relight").is_dir() else ()
         self.hdris = sorted({file.stem for file in relit if file.is_dir() or file.suffix == ".exr"})
@@ -106,17 +106,11 @@ class GroundTruth:
         return Mesh(mesh.vertices @ self._to_run[:3, :3].T + self._to_run[:3, 3], mesh.faces)
 
     def relit(self, hdri: str, camera: Camera) -> np.ndarray:
-        """Read the true picture of the camera's view under the light with the name `hdri`, as premultiplied linear RGBA (h, w, 4).
-
-        A larger picture is reduced.
-        """
+        """Read the true view under the light `hdri` as premultiplied linear RGBA (h, w, 4)."""
         return self._picture(f"relight/{hdri}", camera)
 
     def color(self, camera: Camera) -> np.ndarray:
-        """Read the true picture of the camera's view under the photos' light, as premultiplied linear RGBA (h, w, 4).
-
-        A larger picture is reduced.
-        """
+        """Read the true view under the photos' light as premultiplied linear RGBA (h, w, 4)."""
         return self._picture("color", camera)
 
     def _picture(self, folder: str, camera: Camera) -> np.ndarray:
@@ -127,7 +121,7 @@ class GroundTruth:
 
 
 def check_size(file: Path, pixels: np.ndarray, camera: Camera) -> None:
-    """Raise InputError unless a true picture has the size of the camera's view, or is larger with the same aspect ratio."""
+    """Raise InputError unless a true picture has its view's size or is proportionally larger."""
     (height, width), size = pixels.shape[:2], f"{camera.width}×{camera.height}"
     fitted = camera.resized(width, height).fitted(max(camera.width, camera.height))
     if (fitted.width, fitted.height) != (camera.width, camera.height):
@@ -135,7 +129,7 @@ def check_size(file: Path, pixels: np.ndarray, camera: Camera) -> None:
 
 
 def read_relit(file: Path) -> np.ndarray:
-    """Read a picture of an object under another light, as premultiplied linear RGBA (H, W, 4). Raises InputError if it has no alpha."""
+    """Read a relit picture as premultiplied linear RGBA (H, W, 4). Raises InputError without alpha."""
     pixels = read_exr(file)
     if pixels.ndim != 3 or pixels.shape[2] != 4:
         raise InputError(f"{file} has no alpha: an RGBA picture is needed to put it over a background")

@@ -53,10 +53,7 @@ def bake(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress = la
 
 
 def _composited(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:
-    """Blend the splats at each texel of a texture with C × C texels. Returns the K values of `refgs.render.composite`: (C, C, K).
-
-    C is `size`, or less if the splats are large. Texels need not be finer than 1/FINE of a splat's standard deviation.
-    """
+    """Blend the splats at each texel, as (C, C, K) with C at most `size`."""
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     covered = np.abs(_cross(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0])).sum()
@@ -84,7 +81,7 @@ def _row_blocks(size: int) -> list[slice]:
 
 
 def _enlarged_rows(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
-    """Enlarge a square picture (C, C, K) to (size, size, K), bilinearly. Compute and return only its rows in `rows`."""
+    """Return the given rows of a square picture, bilinearly enlarged to `size`."""
     place = ((np.arange(rows.start, rows.stop) + 0.5) * len(picture) / size - 0.5).clip(0, len(picture) - 1)
     above = place.astype(int)
     below, part = np.minimum(above + 1, len(picture) - 1), (place - above).astype(np.float32)[:, None, None]
@@ -96,10 +93,7 @@ def _enlarged_rows(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
 
 
 def _pad(maps: list[np.ndarray], mask: np.ndarray) -> None:
-    """Fill each texel outside the mask (S, S) with the values of the nearest texel inside it.
-
-    Changes `maps` in place: arrays (S, S) or (S, S, C).
-    """
+    """Fill `maps` outside the mask (S, S) from the nearest texel inside, in place."""
     nearest = cast(np.ndarray, distance_transform_edt(~mask, return_distances=False, return_indices=True))
     for rows in _row_blocks(len(mask)):
         for values in maps:
@@ -111,12 +105,7 @@ def _interpolate(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _in_tangent_space(vectors: np.ndarray, *basis: np.ndarray) -> np.ndarray:
-    """Convert vectors (N, 3) to tangent space. `basis` is three arrays (N, 3): tangents, bitangents and normals. Returns unit vectors.
-
-    A shader converts a vector (x, y, z) back by x·tangent + y·bitangent + z·normal. These three vectors are interpolated, so they are
-    neither orthogonal nor of unit length. So x, y and z must be found by solving a linear system, not by dot products. z is at least 0.05
-    before normalization.
-    """
+    """Convert vectors (N, 3) to unit vectors in a skewed basis: tangents, bitangents and normals."""
     a, b, c = basis
     across = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
     volume = (a * across[:, 0]).sum(axis=1)
@@ -129,7 +118,7 @@ def _in_tangent_space(vectors: np.ndarray, *basis: np.ndarray) -> np.ndarray:
 
 
 def _uv_scene(mesh: UnwrappedMesh, size: int) -> EmbreeScene:
-    """Make a ray-tracing scene of the mesh's uv layout: a flat mesh, in units of texels."""
+    """Make a ray-tracing scene of the mesh's flat uv layout, in texels."""
     flat = np.concatenate([mesh.uv * size, np.zeros((len(mesh.uv), 1))], axis=1).astype(np.float32)
     scene = EmbreeScene()
     TriangleMesh(scene, flat, mesh.faces.astype(np.int32))
@@ -172,10 +161,7 @@ def _rasterise(
 
 
 def _barycentric(points: np.ndarray, corners: np.ndarray, fallback: np.ndarray) -> np.ndarray:
-    """Compute barycentric weights (N, 3) of points (N, 2) in triangles `corners` (N, 3, 2). Points may lie outside.
-
-    For very thin triangles, return the weights in `fallback` (N, 3) instead.
-    """
+    """Compute barycentric weights (N, 3) of 2D points, or `fallback` in very thin triangles."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     c, area = points - corners[:, 0], _cross(a, b)
     good = np.abs(area) > 0.05 * ((a * a).sum(axis=1) + (b * b).sum(axis=1))

@@ -74,7 +74,7 @@ def _check_names(target: Path | None, splats: list[Path]) -> None:
 
 
 def _mesh_files(target: Path | None) -> list[Path]:
-    """List what is written for the mesh file `target`: the file, the folder of textures and, for OBJ, the MTL file."""
+    """List the paths written for the mesh file `target`: mesh, textures and MTL."""
     from refgs.formats.textures import FOLDER
 
     if target is None:
@@ -90,10 +90,7 @@ def _check_absent(files: list[Path], overwrite: bool) -> None:
 
 
 def _read_source(folder: Path, is_run: bool, report: Report) -> "tuple[Run | None, Splats]":
-    """Open the run folder, or read the PLY file of splats. Returns the run (None for a PLY file) and the splats.
-
-    If rows of the PLY file are skipped, the warning about it is sent to `report`.
-    """
+    """Read a run (None for a PLY) and its splats, sending warnings to `report`."""
     from refgs.formats.splats import read_splats
     from refgs.run import open_run
 
@@ -143,7 +140,7 @@ def _write_mesh(run: "Run", target: Path, texture: int | None, report: Report) -
 
 
 def _make_mesh(run: "Run", report: Report) -> "UnwrappedMesh":
-    """Make the run's mesh: fuse depth maps, simplify, fit the mesh to the outlines in renderings, and compute its uv."""
+    """Make the run's mesh with uv, fused, simplified and fitted to its outlines."""
     from refgs.export.outline import fit_to_outlines
     from refgs.export.unwrap import layout, unwrap
     from refgs.geometry.mesh import clean, is_crumbs
@@ -168,10 +165,7 @@ def _make_mesh(run: "Run", report: Report) -> "UnwrappedMesh":
 
 
 def _baked_splats(run: "Run", mesh: "Mesh") -> "Splats":
-    """Return the run's splats for baking. If their base colours contain shadows, the shadows are removed.
-
-    Base colours contain shadows if the training computed no shadows and the light did not move relative to the object.
-    """
+    """Return the run's splats for baking, without shadows in their base colours."""
     from refgs.export.unshadowed import unshadowed
     from refgs.render.baselines import method_of
 

@@ -65,10 +65,7 @@ def fit_to_outlines(
 
 
 def _overshoot(vertices: np.ndarray, views: list[tuple[Camera, np.ndarray]]) -> np.ndarray:
-    """Measure how far vertices (V, 3) lie outside the object's outlines, in world units (V,). Of all views, the largest distance counts.
-
-    `views` are pairs of a camera and the result of `_signed_distance` for its rendering.
-    """
+    """Return the vertices' largest distances (V,) outside the outlines of `_signed_distance`, in world units."""
     overshoot = np.zeros(len(vertices))
     for camera, distance in views:
         x, y, z = camera.world_to_camera[:3, :3] @ vertices.T + camera.world_to_camera[:3, 3:]
@@ -79,10 +76,7 @@ def _overshoot(vertices: np.ndarray, views: list[tuple[Camera, np.ndarray]]) -> 
 
 
 def _smoother(mesh: Mesh) -> Callable[[np.ndarray], np.ndarray]:
-    """Make a function that smooths values (V,) by averaging each vertex with its neighbours, SMOOTHING_STEPS times.
-
-    Measured outlines are off by a fraction of a pixel. Smoothing reduces this error.
-    """
+    """Return a function that smooths vertex values (V,) by averaging neighbours SMOOTHING_STEPS times."""
     a, b = np.concatenate([mesh.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]).T
     count = len(mesh.vertices)
     near = coo_matrix((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), (count, count)).tocsr() + identity(count)
@@ -97,17 +91,14 @@ def _smoother(mesh: Mesh) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _signed_distance(alpha: np.ndarray) -> np.ndarray:
-    """Compute the distance in pixels from each place in a picture to the object's outline, negative outside the object.
-
-    The result has UPSAMPLING times as many rows and columns as the object's `alpha`.
-    """
+    """Return the distance in pixels to `alpha`'s outline, negative outside, UPSAMPLING times as fine."""
     fine = cv2.resize(alpha, None, fx=UPSAMPLING, fy=UPSAMPLING, interpolation=cv2.INTER_LINEAR) >= 0.5
     inner, outer = (cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) for mask in (fine, ~fine))
     return np.where(fine, inner - 0.5, 0.5 - outer) / UPSAMPLING
 
 
 def _look_up(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Read values of a picture that was enlarged UPSAMPLING times. `x` and `y` are positions in pixels of the original picture."""
+    """Read an UPSAMPLING times enlarged picture at pixel positions of the original."""
     row, column = ((UPSAMPLING * v).astype(int) for v in (y, x))
     return picture[row.clip(0, len(picture) - 1), column.clip(0, picture.shape[1] - 1)]
 

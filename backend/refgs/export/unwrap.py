@@ -54,7 +54,7 @@ def unwrap(mesh: SmoothMesh) -> UnwrappedMesh:
 
 
 def _parts(mesh: Mesh) -> list[np.ndarray]:
-    """Halve the mesh across its longest axis until all parts have at most PART triangles. Returns the face indices of each part."""
+    """Halve the mesh into parts of at most PART triangles; return their face indices."""
     middle, done, left = mesh.vertices[mesh.faces].mean(axis=1), [], [np.arange(len(mesh.faces))]
     while left:
         part = left.pop()

@@ -64,10 +64,7 @@ class Image:
 
 
 def model_files(folder: Path) -> tuple[Path, Path, Path]:
-    """Return the paths of a COLMAP model's cameras, images and points. The files may be missing.
-
-    The names end in .bin if images.bin exists, otherwise in .txt.
-    """
+    """Return the paths of a COLMAP model's cameras, images and points, existing or not."""
     suffix = ".bin" if (folder / "images.bin").is_file() else ".txt"
     cameras, images, points = (folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D"))
     return cameras, images, points
@@ -79,7 +76,7 @@ def read_cameras(file: Path) -> dict[int, Intrinsics]:
 
 
 def read_images(file: Path) -> list[Image]:
-    """Read the names, camera ids and poses of a COLMAP model's images. Raises InputError for a broken file."""
+    """Read the images of a COLMAP model. Raises InputError for a broken file."""
     return _parse(file, _binary_images, _text_images)
 
 
@@ -111,7 +108,7 @@ def _parse(file: Path, binary: Callable[[Path], T], text: Callable[[Path], T]) -
 
 
 class _Reader:
-    """Read values from a binary file one after the other. Raises struct.error or ValueError if the file is truncated."""
+    """Read consecutive values of a binary file. Raises struct.error or ValueError if truncated."""
 
     def __init__(self, file: BinaryIO):
         self._file, self._size = file, os.fstat(file.fileno()).st_size
@@ -195,10 +192,7 @@ def _points(numbers: array) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _entries(file: Path, first: Callable[[str], bool] = lambda line: True) -> list[str]:
-    """Return the first line of each entry in a COLMAP text file. The function `first` returns True for such a line.
-
-    Comments and empty lines are left out. Raises ValueError if a line is too long, or if the file has fewer entries than its header says.
-    """
+    """Return the lines of a COLMAP text file that `first` accepts. Raises ValueError."""
     entries, counted = [], None
     with open_file(file) as opened:
         while data := opened.readline(LARGEST):
@@ -235,10 +229,7 @@ def _text_images(file: Path) -> list[Image]:
 
 
 def _is_image(line: str) -> bool:
-    """Return True if a line of images.txt describes an image, and False if it lists keypoints.
-
-    An image's line ends in the image's name. A list of keypoints has three numbers for each keypoint. Raises ValueError for any other line.
-    """
+    """Tell whether a line of images.txt is an image, not keypoints. Raises ValueError."""
     values = line.split()
     try:
         float(values[-1])

@@ -108,10 +108,7 @@ def read_exr(path: str | os.PathLike, is_data: bool = False) -> np.ndarray:
 
 
 def _as_rec709(path: Path, pixels: np.ndarray, primaries: np.ndarray) -> np.ndarray:
-    """Convert linear pixels (H, W, 3 | 4) from a file's chromaticities `primaries` to Rec.709, in place.
-
-    Colours outside Rec.709's gamut get negative components. Raises InputError, which names `path`, if `primaries` give no finite matrix.
-    """
+    """Convert linear pixels from the chromaticities `primaries` to Rec.709 in place. Raises InputError."""
     if primaries.shape == np.shape(REC709) and np.allclose(primaries, REC709, atol=1e-3):
         return pixels
     try:
@@ -124,7 +121,7 @@ def _as_rec709(path: Path, pixels: np.ndarray, primaries: np.ndarray) -> np.ndar
 
 
 def _check_flat(path: Path, headers: list[dict]) -> None:
-    """Raise InputError, which names `path`, if a file is a deep EXR. In a deep EXR, each pixel has a list of samples."""
+    """Raise InputError if a file is a deep EXR."""
     if any(header["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile) for header in headers):
         raise InputError(f"{path} is a deep EXR: save it flattened, with one value a pixel")
 

@@ -99,10 +99,7 @@ def read_glb(path: str | os.PathLike) -> Mesh:
 
 
 def _check_self_contained(data: bytes) -> None:
-    """Raise ValueError if a binary glTF file refers to other files, or has an accessor with more elements than the file has bytes.
-
-    Without this check, a file could make its reader open any other file, or allocate any amount of memory. `data` is the file's content.
-    """
+    """Raise ValueError if binary glTF refers to other files, or declares more elements than bytes."""
     length, kind = struct.unpack_from("<I4s", data, 12)
     if kind != b"JSON":
         raise ValueError("it does not begin with JSON")

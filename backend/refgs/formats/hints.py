@@ -35,13 +35,13 @@ class _Hints(Model):
 
 
 def read_hints(file: Path) -> list[Hint]:
-    """Read the hints in a JSON file. Raises InputError if the file cannot be read, is no file of hints, or has no hint."""
+    """Read one hint or more from a JSON file, or raise InputError."""
     again = 'Hints are JSON as {"hints": [{"kind": "metal", "points": [[0.1, 0.2, 0.3]]}]}: say of one part at least what it is.'
     found = read_json(file, _Hints, again)
     return [Hint(part.kind, np.array(part.points, np.float64)) for part in found.hints]
 
 
 def write_hints(file: Path, run: Path, hints: list[Hint]) -> None:
-    """Write hints to a JSON file, together with the path of the run folder `run`. The hints mark splats of this run."""
+    """Write hints, which mark splats of the folder `run`, to a JSON file."""
     listed = [{"kind": hint.kind, "points": hint.points.tolist()} for hint in hints]
     write_text(file, json.dumps({"run": str(run.resolve()), "hints": listed}))

@@ -38,5 +38,5 @@ def read(file: Path) -> tuple[list[dict], int]:
 
 
 def damage(count: int) -> str:
-    """Return a sentence that tells the user how many lines of history.jsonl, `count`, are damaged and left out."""
+    """Return a sentence telling the user that `count` lines of history.jsonl are left out."""
     return f"{FILE} has damaged lines, which are left out: {count}"

@@ -18,11 +18,7 @@ Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # rotation from Z up to the
 
 @dataclass
 class Mesh:
-    """Hold a triangle mesh.
-
-    - vertices (V, 3): float64, in world units
-    - faces (F, 3): vertex indices, counter-clockwise as seen from outside
-    """
+    """Hold a triangle mesh: vertices (V, 3) in world units, counter-clockwise faces (F, 3)."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -41,13 +37,13 @@ class SmoothMesh(Mesh):
 
 @dataclass
 class UnwrappedMesh(SmoothMesh):
-    """Hold a smooth triangle mesh with texture coordinates `uv` (V, 2), in 0..1, with v upward."""
+    """Hold a smooth mesh with texture coordinates `uv` (V, 2) in 0..1, v upward."""
 
     uv: np.ndarray
 
 
 def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
-    """Write a mesh's vertices and faces as a binary PLY file. A failed write leaves no partial file."""
+    """Write vertices and faces as binary PLY, completely or not at all."""
     with whole(path) as temporary:
         data = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="ply")
         temporary.write_bytes(cast(bytes, data))

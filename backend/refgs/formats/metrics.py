@@ -13,7 +13,7 @@ class _Figures(RootModel[dict[str, JsonValue]]):
 
 
 class Said(Model):
-    """Hold a message for the user, `what`, about a measurement. `what` is None if there is nothing to report."""
+    """Hold a message for the user about a measurement, None if there is none."""
 
     what: str | None = None
 
@@ -35,7 +35,7 @@ class Metrics(Model):
 
 
 def read_metrics(file: Path) -> tuple[dict[str, Any], Metrics]:
-    """Read a metrics.json as nested dicts, and as `Metrics`. Raises InputError naming the file and the value that is wrong."""
+    """Read a metrics.json as nested dicts and as `Metrics`. Raises InputError."""
     again = "Remove it, and evaluate the run again."
     found = read_json(file, _Figures, again).root
     return found, validated(found, Metrics, str(file), again)

@@ -91,6 +91,6 @@ class Row(Model):
 
 
 class Needs(RootModel[list[Row]]):
-    """Hold the rows of needs.json, one for each optional part of the training that was decided about."""
+    """Hold needs.json: a row for each optional training part that was decided about."""
 
     model_config = ConfigDict(frozen=True)

@@ -66,10 +66,7 @@ def directions(height: int, width: int) -> np.ndarray:
 
 
 def sample(panorama: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Look up a panorama (H, W, C) in directions (..., 3) of any length. Returns the radiance (..., C).
-
-    The look-up is bilinear. The left and right edges are joined.
-    """
+    """Look up a panorama (H, W, C) bilinearly in directions (..., 3) of any length."""
     height, width = panorama.shape[:2]
     x, y, z = np.moveaxis(np.asarray(directions, np.float32), -1, 0)
     column = (0.5 - np.arctan2(y, x) / (2 * np.pi)) * width - 0.5

@@ -53,10 +53,7 @@ def check_length(path: Path) -> None:
 
 
 def check_chunks(path: Path) -> None:
-    """Raise InputError if a chunk of a PNG declares more bytes than the file has. Other formats are not checked.
-
-    Without this check, OpenCV would allocate the declared bytes.
-    """
+    """Raise InputError if a PNG's chunk declares more bytes than the file has."""
     size = path.stat().st_size
     with open_file(path) as file:
         for _, length in png_chunks(file):
@@ -97,7 +94,7 @@ def check_scans(path: Path, width: int, height: int) -> None:
 
 
 def read_png(path: Path, flags: int = -1) -> np.ndarray | None:
-    """Read a PNG in a run folder as `cv2.imread` does with these `flags`. Return None if it is missing, broken, too large, or no PNG."""
+    """Read a run's PNG as `cv2.imread` does, None if it cannot be used."""
     try:
         check_file(path)
         with Image.open(path, formats=("PNG",)) as picture:

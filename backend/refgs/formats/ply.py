@@ -78,7 +78,7 @@ def check_header(file, path: Path) -> None:
 
 
 def _count_lines(file, path: Path) -> int:
-    """Count the lines in the rest of a file, except blank lines. Raises InputError for a line of LONGEST_LINE bytes or more."""
+    """Count the remaining non-blank lines. Raises InputError for one of LONGEST_LINE bytes."""
     count = 0
     while line := file.readline(LONGEST_LINE):
         if len(line) == LONGEST_LINE:
@@ -88,12 +88,7 @@ def _count_lines(file, path: Path) -> int:
 
 
 def _elements(lines: list[list[str]], path: Path) -> list[tuple[int, list[tuple[int, float]]]]:
-    """Parse a PLY header. `lines` are its lines, each split into words.
-
-    Returns a pair for each element: its number of rows, and a list of its properties' sizes. A size is itself a pair: the fewest and the
-    most bytes that the property takes in a row of a binary file. The two differ only for a list property, which stores the number of its
-    values before the values. Raises InputError for a broken header.
-    """
+    """Return each PLY element's row count and its properties' least and most bytes. Raises InputError."""
     elements: list[tuple[int, list[tuple[int, float]]]] = []
     for line in lines:
         match line:

@@ -44,7 +44,7 @@ class Trained(Maker):
 
 
 class Change(Model):
-    """Hold a row of the table [changed]: a setting that the training has changed. `asked` is the value that the user gave."""
+    """Hold a setting that the training changed; `asked` is the user's value."""
 
     asked: Any
 

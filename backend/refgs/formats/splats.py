@@ -114,7 +114,7 @@ def write_display_splats(path: str | os.PathLike, splats: Splats) -> None:
 
 
 def _common_columns(splats: Splats, scales: np.ndarray) -> tuple[list[str], list[np.ndarray]]:
-    """List the columns that every PLY file of splats has. Returns their names, and their values as 3DGS encodes them."""
+    """Return the columns common to all PLY files: names, and values encoded as in 3DGS."""
     opacity = np.clip(splats.opacities.astype(np.float64), 1e-6, 1 - 1e-6)
     rest = splats.sh[:, 1:].transpose(0, 2, 1)
     columns = [
@@ -199,10 +199,7 @@ def read_splats(path: str | os.PathLike) -> Splats:
         return structured_to_unstructured(repack_fields(part) if rows.dtype.hasobject else part, np.float32, copy=True)
 
     def harmonics(prefix: str, *counts: int) -> np.ndarray:
-        """Read the columns PREFIX0, PREFIX1 … as harmonics (N, K, 3).
-
-        Raises InputError if a column is missing, or if the number of columns, 3·K, is not in `counts`.
-        """
+        """Read PREFIX0 … as harmonics (N, K, 3). Raises InputError unless 3·K is in `counts`."""
         found = sum(re.fullmatch(rf"{prefix}\d+", name) is not None for name in names)
         wanted = [f"{prefix}{i}" for i in range(found)]
         if found not in counts or not {*wanted} <= {*names}:
@@ -274,7 +271,7 @@ def _third_axis(rotations: np.ndarray) -> np.ndarray:
 
 
 def _shortest_last(rotations: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Reorder the axes of 3D Gaussians so that the shortest, which is the normal, is the third. Returns new rotations and scales."""
+    """Reorder 3D Gaussians' axes so that the shortest, the normal, is the third."""
     shortest = np.where(scales[:, 2] <= scales.min(axis=1), 2, scales.argmin(axis=1))
     w, x, y, z = rotations.T
     a, b, c, d = _TO_THIRD[shortest].T
@@ -288,7 +285,7 @@ def _shortest_last(rotations: np.ndarray, scales: np.ndarray) -> tuple[np.ndarra
 
 
 def _other_elements(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[PlyElement, ...]:
-    """Copy the elements of a PLY file. Leave out the properties of `vertex` that are named in `known`."""
+    """Copy PLY elements without the properties of `vertex` named in `known`."""
     kept = []
     for element in elements:
         more = [p for p in element.properties if element.name != "vertex" or p.name not in known]
@@ -300,10 +297,7 @@ def _other_elements(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[
 
 
 def _without_nonfinite(splats: Splats, path: Path) -> Splats:
-    """Remove splats with a NaN or infinite value, and warn with an InputWarning.
-
-    If a splat is removed, the PLY elements other than `vertex` are dropped. They may refer to splats by row number, which has changed.
-    """
+    """Remove nonfinite splats with an InputWarning, and in that case also other elements."""
     values = {name: value for name, value in vars(splats).items() if isinstance(value, np.ndarray)}
     wrong = [name for name, value in values.items() if not np.isfinite(value).all()]
     if not wrong:

@@ -16,7 +16,7 @@ def _rows(text: Any) -> list[list[str]]:
 
 
 class Metadata(Model):
-    """Hold a camera: its camera-to-world matrix (4, 4) with OpenGL's axes, horizontal field of view in radians, and size in pixels."""
+    """Hold a camera: OpenGL camera-to-world matrix, horizontal field of view (radians), and size (pixels)."""
 
     cam_transform_mat: Annotated[Matrix, BeforeValidator(_rows)]
     cam_angle_x: Number | None = None
@@ -25,5 +25,5 @@ class Metadata(Model):
 
 
 def read_metadata(file: Path) -> Metadata:
-    """Read the camera of a view. Raises InputError naming the file and the value that is wrong."""
+    """Read the camera of a view. Raises InputError."""
     return read_json(file, Metadata, "Download the data set again.")

@@ -19,7 +19,7 @@ Positive = Annotated[Finite, Field(gt=0)]
 
 
 class Intrinsics(Model):
-    """Hold the intrinsics of a camera. Focal lengths, principal point and size are in pixels. A value that is not given is None."""
+    """Hold a camera's intrinsics, in pixels and radians; None means not given."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -37,7 +37,7 @@ class Intrinsics(Model):
 
     @property
     def lens_keys(self) -> dict[str, Any]:
-        """Return the file's keys that describe the lens but are no fields of this class, such as `k1`, with their values."""
+        """Return the lens keys that are no fields, such as `k1`, with their values."""
         return {key: value for key, value in (self.model_extra or {}).items() if _of_lens(key)}
 
 
@@ -55,7 +55,7 @@ def _of_lens(key: str) -> bool:
 
 
 class Frame(Intrinsics):
-    """Hold one camera. `transform_matrix` is its camera-to-world matrix with OpenGL's axes, (4, 4) or (3, 4)."""
+    """Hold one camera; `camera_convention`, or else OpenGL, names the axes of its camera-to-world matrix."""
 
     file_path: str
     transform_matrix: Matrix
@@ -63,7 +63,7 @@ class Frame(Intrinsics):
 
     @property
     def path(self) -> str:
-        """Return the photo's path with forward slashes, relative to the folder of the file that has the frame."""
+        """Return the photo's path relative to the camera file's folder, with forward slashes."""
         return self.file_path.replace("\\", "/")
 
     @model_validator(mode="after")
@@ -74,12 +74,12 @@ class Frame(Intrinsics):
 
 
 class _Cameras(Model):
-    """Hold the `frames` of a file. Intrinsics that the file gives once, for all frames, are copied into each frame."""
+    """Hold a file's `frames`, each with the intrinsics that the file shares."""
 
     @model_validator(mode="before")
     @classmethod
     def _share(cls, data: Any) -> Any:
-        """Copy the intrinsics at the file's top level into each frame that does not give them itself."""
+        """Copy the file's intrinsics into each frame that does not give its own."""
         if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
             return data
         shared = {key: value for key, value in data.items() if key in Intrinsics.model_fields or _of_lens(key)}
@@ -117,17 +117,14 @@ class RunFrame(Frame):
 
 
 class RunCameras(_Cameras):
-    """Hold a run's cameras.json. The cameras are in the run's coordinates.
-
-    `to_capture` is the matrix from the run's coordinates to the capture's coordinates.
-    """
+    """Hold a run's cameras in its coordinates; `to_capture` is the matrix to the capture's."""
 
     frames: list[RunFrame]
     to_capture: Matrix
 
 
 class NovelFrame(Frame):
-    """Hold a camera in Stanford-ORB's transforms_novel.json. Its photo, in the folder `scene_name`, shows the object in another scene."""
+    """Hold a Stanford-ORB camera whose photo shows the object in the scene `scene_name`."""
 
     scene_name: str
 
@@ -139,15 +136,15 @@ class NovelCameras(_Cameras):
 
 
 def read_transforms(file: Path) -> Transforms:
-    """Read a JSON file of cameras, whichever program wrote it. Raises InputError naming the file, the frame and the value that is wrong."""
+    """Read a JSON file of cameras from any program. Raises InputError."""
     return read_json(file, Transforms, AGAIN)
 
 
 def read_novel_transforms(file: Path) -> NovelCameras:
-    """Read Stanford-ORB's transforms_novel.json. Raises InputError naming the file, the frame and the value that is wrong."""
+    """Read Stanford-ORB's transforms_novel.json. Raises InputError."""
     return read_json(file, NovelCameras, "Download the data set again.")
 
 
 def read_run_transforms(file: Path) -> RunCameras:
-    """Read a run's cameras.json. Raises InputError naming the file, the frame and the value that is wrong."""
+    """Read a run's cameras.json. Raises InputError."""
     return read_json(file, RunCameras, "Use the file that the training wrote.")

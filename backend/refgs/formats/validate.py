@@ -24,7 +24,7 @@ Matrix = list[list[float]]
 
 
 class Model(BaseModel):
-    """Serve as the base class of models. A model declares the fields that are read from one kind of file. Other fields are ignored."""
+    """Serve as the base class for files' models, which ignore undeclared fields."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -33,33 +33,27 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def read_json(file: Path, model: type[M], again: str) -> M:
-    """Read a JSON file into a model. Raises InputError if it is missing or wrong. `again`, advice for the user, ends the message."""
+    """Read a JSON file into a model. Raises InputError, whose message ends with `again`."""
     return validated(parse_json(read_text(file, again), str(file), again), model, str(file), again)
 
 
 def read_toml(file: Path, model: type[M], again: str) -> M:
-    """Read a TOML file into a model. Raises InputError if it is missing or wrong. `again`, advice for the user, ends the message."""
+    """Read a TOML file into a model. Raises InputError, whose message ends with `again`."""
     return validated(read_tables(file, again), model, str(file), again)
 
 
 def read_tables(file: Path, again: str) -> dict[str, Any]:
-    """Read a TOML file as nested dicts. Raises InputError if it is missing or broken. `again`, advice for the user, ends the message."""
+    """Read a TOML file as nested dicts. Raises InputError, whose message ends with `again`."""
     return parse_toml(read_text(file, again), str(file), again)
 
 
 def parse_json(text: str, source: str, again: str) -> Any:
-    """Parse JSON. Raises InputError if it is broken.
-
-    The error's message begins with `source` and ends with `again`, advice for the user.
-    """
+    """Parse JSON. Raises InputError, whose message begins with `source` and ends with `again`."""
     return _parsed(json.loads, text, source, "JSON", again)
 
 
 def parse_toml(text: str, source: str, again: str) -> dict[str, Any]:
-    """Parse TOML as nested dicts. Raises InputError if it is broken.
-
-    The error's message begins with `source` and ends with `again`, advice for the user.
-    """
+    """Parse TOML. Raises InputError, whose message begins with `source` and ends with `again`."""
     return _parsed(tomllib.loads, text, source, "TOML", again)
 
 
@@ -91,11 +85,7 @@ def validated(data: Any, model: type[M], source: str, again: str) -> M:
 
 
 def _place(error: Any, data: Any) -> tuple[list[str], str]:
-    """Return where in `data` pydantic found an error: the frame, if any, and the field's keys joined by dots.
-
-    A frame is a dict with a `file_path`, as in transforms.json. It is returned as a list of one text, "frame PATH". The list is empty for a
-    field outside all frames.
-    """
+    """Return where an error is: ["frame PATH"] or [], and the keys joined by dots."""
     where, keys = [], []
     for part in error["loc"]:
         known = range(len(data)) if isinstance(data, list) else data if isinstance(data, dict) else ()

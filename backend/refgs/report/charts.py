@@ -37,10 +37,7 @@ PARTS = {  # parts of a run's time and their titles, in the order of the bar
 
 @contextmanager
 def _drawing(width: float, height: float) -> Iterator[tuple[Figure, list[str]]]:
-    """Yield an empty matplotlib figure of this size in inches, and an empty list.
-
-    When the `with` block ends, the figure is drawn as SVG, and this text is appended to the list.
-    """
+    """Yield a figure, sized in inches, and a list that gets its SVG afterwards."""
     style = {"svg.fonttype": "none", "svg.hashsalt": "refgs", "font.family": "sans-serif", "font.size": 10}
     style |= dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK)
     style["text.parse_math"] = False  # runs' names may hold dollar signs

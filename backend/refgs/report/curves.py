@@ -27,11 +27,11 @@ class Quantity(NamedTuple):
     decibels: bool = False
 
     def error(self, value: float) -> float:
-        """Convert a value of history.jsonl to the error that curves show. A PSNR in dB becomes an RMS error, 1e300 at most."""
+        """Convert a value of history.jsonl to an error; a PSNR becomes an RMS error."""
         return 10 ** (-max(value, -6000.0) / 20) if self.decibels else value
 
     def text(self, error: float) -> str:
-        """Format an error for the report: in decibels if it comes from a PSNR, otherwise as a plain number."""
+        """Format an error, in decibels if it comes from a PSNR."""
         return f"{-20 * np.log10(error):.4g} dB" if self.decibels else f"{error:.3g}"
 
 
@@ -50,7 +50,7 @@ QUANTITIES = (
 
 
 class Curve(NamedTuple):
-    """Hold one run's values of one error measure: errors (n,), and the iterations and seconds (n,) of measurement, sorted by time."""
+    """Hold one run's errors (n,) with their iterations and seconds, sorted by time."""
 
     run: str
     quantity: Quantity

@@ -94,10 +94,7 @@ def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None,
 def _measure_view(
     run: Run, view: View, loaded: LoadedView, truth: GroundTruth | None, pictures: Path, with_lpips: bool
 ) -> dict[str, Any]:
-    """Render one view, and compare it with its photo and with the true maps, such as normals. Returns the metrics.
-
-    Writes the photo, the rendering and all maps, rendered and true ones, as pictures into the folder `pictures`.
-    """
+    """Render a view, write its pictures to `pictures`, and return its metrics."""
     camera, background = loaded.camera, np.array(run.settings.image.background, dtype=np.float32)
     rendering = run.render(camera)
     color = np.clip(rendering.color.numpy(), 0, 1)
@@ -139,21 +136,14 @@ def _measure_view(
 
 
 def _doubt(run: Run, camera: Camera) -> np.ndarray:
-    """Render the splats' `doubt` as a camera sees it. Returns (H, W) in 0..1.
-
-    It is 0 where the photos show whether the surface is metal or paint, and 1 where they do not. `run.splats.doubt` must not be None.
-    """
+    """Render the splats' `doubt` (H, W) in 0..1; `run.splats.doubt` must not be None."""
     feature = torch.from_numpy(run.splats.doubt)[:, None]
     drawn = rasterize(*discs(run.surfels(), camera), feature, camera, near=run.near)
     return (drawn.features[..., 0] / drawn.alpha.clamp_min(COVERED)).numpy()
 
 
 def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dict[str, float]]:
-    """Compare the recovered light with the true light, and write both as pictures. Returns the metrics.
-
-    The lights cannot be compared if the true light is unknown, or if the recovered light turns with the camera. Then only the picture of
-    the recovered light is written, and the result is {}.
-    """
+    """Compare the recovered with the true light, if possible, and write both as pictures."""
 
     def write(name: str, panorama: np.ndarray) -> None:
         small = metrics.resized(panorama, min(PANORAMA, len(panorama)))
@@ -176,11 +166,7 @@ def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[
 def _measure_relit(
     run: Run, hdri: str, cameras: list[Camera], truth: GroundTruth, pictures: Path, next_step: Callable[[str], None]
 ) -> dict[str, float]:
-    """Render the views under another light and compare them with ground truth. Returns the metrics.
-
-    Writes the renderings and the true pictures into the folder `pictures`. `hdri` is the light's name in the ground truth. Each view is
-    rendered twice, because keeping all renderings takes too much memory. `next_step` is called with a note after each rendering.
-    """
+    """Return the metrics of the views under the light `hdri`, and write the pictures."""
     light = run.light(truth.panorama(f"relight/{hdri}"))
 
     # Each call renders again, because keeping all pictures takes too much memory.
@@ -196,10 +182,7 @@ def _measure_relit(
 
 
 def _measure_speed(run: Run, cameras: list[Camera]) -> dict[str, float | str]:
-    """Measure how fast the renderer is. It runs on a CUDA card if one can be used, else on the CPU.
-
-    Returns two metrics. `frames_per_second` is 1 / the median time of a frame. `frames_device` is the card's name or "cpu".
-    """
+    """Measure `frames_per_second`, and name `frames_device`: the CUDA card or "cpu"."""
     device = torch.device("cuda" if cuda.unusable() is None else "cpu")
     surfels = Surfels(*(value.to(device) for value in run.surfels()))
     light = run.environment and Environment(run.environment.radiance.to(device), run.environment.reference)

@@ -26,7 +26,7 @@ class Quantity(NamedTuple):
 
 
 def duration(seconds: float) -> str:
-    """Format a number of seconds: as minutes and seconds from one minute on, otherwise as seconds."""
+    """Format seconds as minutes and seconds from one minute on, else as seconds."""
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
 
@@ -70,7 +70,7 @@ DETAILS = [
 
 
 def is_number(value: object) -> TypeGuard[int | float]:
-    """Tell whether a value is a number that a float can hold: finite, and no integer of hundreds of digits."""
+    """Tell whether a value is a finite number that a float can hold."""
     most = sys.float_info.max
     return isinstance(value, int | float) and not isinstance(value, bool) and -most <= value <= most
 
@@ -85,7 +85,7 @@ def flatten(values: object, prefix: str = "") -> Iterator[tuple[str, float]]:
 
 
 def in_words(metrics: dict, figures: list[Quantity]) -> list[str]:
-    """Format the metrics that `figures` describes as text, such as "PSNR 24.31 dB". Skip those that `metrics` lacks."""
+    """Format metrics that `figures` describes as text, such as "PSNR 24.31 dB"."""
     known = dict(flatten(metrics))
     return [f"{heading} {text(known[key])}" for key, heading, text, _ in figures if key in known]
 
@@ -106,7 +106,7 @@ def relit_pair(figures: dict[str, float], prefix: str) -> str:
 
 
 def relit_in_words(metrics: dict) -> list[str]:
-    """Format PSNR and FLIP of pictures under other lights: a line for each light and each way of rendering (surfels, splats, mesh)."""
+    """Format PSNR and FLIP as a line for each light and way of rendering."""
     known = dict(flatten(metrics))
     lit = [(hdri, kind) for hdri, kinds in metrics.get("relight", {}).items() for kind in kinds]
     return [

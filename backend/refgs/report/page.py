@@ -57,7 +57,7 @@ LARGEST_SIDE = 512  # pixels, so that the page stays small enough to open
 
 @dataclass
 class RunPage:
-    """Hold what the report page shows of one run. On a page about several runs, `label` is the run's unique name."""
+    """Hold what the report shows of one run; `label` is its unique name."""
 
     name: str
     label: str
@@ -114,7 +114,7 @@ def write_report(runs: list[Path], out: Path) -> None:
 
 
 def template(file: Path) -> jinja2.Template:
-    """Load a page's HTML template for Jinja. It may include files from its own folder and from the report's, such as style.html."""
+    """Load a page's Jinja template, which may include files of the report's folder."""
     folders = [file.parent, Path(__file__).parent]
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(folders), autoescape=True, trim_blocks=True, lstrip_blocks=True
@@ -171,7 +171,7 @@ def _read_run(folder: Path) -> RunPage:
 
 
 def _settings(file: Path) -> tuple[str, Summary]:
-    """Read a run.toml. Returns the file's text, and its parsed content. Raises InputError if it cannot be read."""
+    """Return a run.toml's text and its parsed content. Raises InputError."""
     again = "Copy the run folder again."
     text = read_text(file, again)
     return text, validated(parse_toml(text, str(file), again), Summary, str(file), again)
@@ -182,14 +182,7 @@ def _needs(file: Path) -> Needs:
 
 
 def _decisions(folder: Path, rows: list[Row]) -> list[dict]:
-    """Describe for the page which optional parts of the training a run kept or left out. `rows` are those of needs.json.
-
-    Returns a dict for each row that has pictures:
-
-    - "what": the decision in words
-    - "figures": a line with the PSNR of one view, rendered with the part and without it
-    - "pictures": data URLs of these two renderings, and of the view's photo
-    """
+    """Return "what", "figures" and "pictures" (data URLs) for each row that has pictures."""
     found = []
     for row in rows:
         if (shown := row.pictures) is None:
@@ -204,7 +197,7 @@ def _decisions(folder: Path, rows: list[Row]) -> list[dict]:
 
 
 def _history(folder: Path, missing: list[str]) -> list[dict]:
-    """Read history.jsonl. Skip lines that have no number "seconds". Add to `missing` a sentence on what cannot be read."""
+    """Read history.jsonl's lines with "seconds", and add to `missing` what cannot be read."""
     without = "there is no chart of error against time"
     try:
         lines, damaged = history.read(folder / history.FILE)
@@ -220,11 +213,7 @@ def _history(folder: Path, missing: list[str]) -> list[dict]:
 
 
 def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[str, str]]:
-    """Read the pictures folder/KIND/NAME.png as data URLs: {name: {kind: data URL}}. The keys of `kinds` are the kinds to read.
-
-    Names with fewer kinds than other names are skipped. If more than `most` names are left, only `most` of them are read, evenly spaced in
-    alphabetical order.
-    """
+    """Return {name: {kind: data URL}} of folder/KIND/NAME.png, for at most `most` complete names."""
     count = Counter(path.stem for kind in kinds for path in folder.glob(f"{kind}/*.png"))
     names = sorted(name for name in count if count[name] == max(count.values()))
     if len(names) > most:
@@ -234,7 +223,7 @@ def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[
 
 
 def _embed(path: Path) -> str:
-    """Return a picture as a data URL, scaled down to LARGEST_SIDE pixels. Return "" if the picture is missing or broken."""
+    """Return a picture as a data URL of at most LARGEST_SIDE pixels, or ""."""
     image = read_png(path)
     if image is None:
         return ""
@@ -248,15 +237,12 @@ def _embed(path: Path) -> str:
 
 
 def _unique_names(groups) -> list[str]:
-    """List the names in all groups without duplicates, in the order in which they first occur."""
+    """List the names in all groups once each, in order of first occurrence."""
     return list(dict.fromkeys(name for group in groups for name in group))
 
 
 def _columns(pages: list[RunPage], figures: list[Quantity]) -> list[dict]:
-    """Make a table column for each metric in the list `figures`, except those that no run has.
-
-    A column has a heading and a cell for each run: the formatted value, and whether it is the best.
-    """
+    """Make a column of cells (text, is best) for each metric that any run has."""
     columns = []
     for key, heading, text, better in figures:
         values = [page.figures.get(key) for page in pages]
@@ -270,10 +256,7 @@ def _columns(pages: list[RunPage], figures: list[Quantity]) -> list[dict]:
 
 
 def _relit_table(pages: list[RunPage]) -> list[dict]:
-    """Make the table of PSNR and FLIP of pictures under other lights.
-
-    It has a row for each light and each way of rendering (surfels, splats, mesh), with a cell for each run.
-    """
+    """Make a row of PSNR and FLIP for each light and way of rendering."""
     found = _unique_names({key.rsplit(".", 1)[0] for key in sorted(page.figures) if _is_relit(key)} for page in pages)
     rows = []
     for prefix in sorted(found):
@@ -289,7 +272,7 @@ def _is_relit(key: str) -> bool:
 
 
 def _other_figures(pages: list[RunPage]) -> list[dict]:
-    """Make a table row for each metric that is not in another table of the page."""
+    """Make a table row for each metric that no other table shows."""
     shown = {figure.key for figure in HEADLINE + DETAILS}
     keys = [key for key in _unique_names(page.figures for page in pages) if key not in shown and not _is_relit(key)]
     texts = {key: [page.figures.get(key) for page in pages] for key in keys}
@@ -297,10 +280,7 @@ def _other_figures(pages: list[RunPage]) -> list[dict]:
 
 
 def _error_curves(pages: list[RunPage]) -> list[list[Curve]]:
-    """Make the curves of error over training time.
-
-    Returns a list for each error measure that was recorded, with a curve for each run that recorded it.
-    """
+    """Return, for each recorded error measure, the curves of all runs that have it."""
     groups = []
     for quantity in QUANTITIES:
         curves = [curve(page.label, page.history, quantity) for page in pages]
@@ -310,7 +290,7 @@ def _error_curves(pages: list[RunPage]) -> list[list[Curve]]:
 
 
 def _time_tables(groups: list[list[Curve]]) -> list[dict]:
-    """Make a table for each error measure: when each run reached certain errors, and where the knee of its curve is."""
+    """Make a table of times to reach errors, and knees, for each error measure."""
     tables = []
     for curves in groups:
         quantity, errors = curves[0].quantity, levels(curves)
@@ -331,15 +311,12 @@ def _duration_or_dash(seconds: float | None) -> str:
 
 
 def _seconds_by_work(page: RunPage) -> dict[str, float]:
-    """Return the seconds that a run spent on each kind of work, such as shading: {kind of work: seconds}.
-
-    They are in the last line of history.jsonl that has "parts".
-    """
+    """Return the seconds that a run spent on each kind of work, such as shading."""
     return next((dict(flatten(line["parts"])) for line in reversed(page.history) if line.get("parts")), {})
 
 
 def _parts_table(parts: dict[str, dict[str, float]]) -> list[dict]:
-    """Make a table row for each kind of work, such as shading (see `charts.PARTS`): seconds and percentage for each run."""
+    """Make a row of seconds and percentages for each kind of work in PARTS."""
     rows = []
     for name, title in PARTS.items():
         seconds = [spent.get(name, 0.0) for spent in parts.values()]

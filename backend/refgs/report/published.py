@@ -47,11 +47,7 @@ def measure(
 def _tensoir(
     run: Run, cameras: list[Camera], truth: TensoIRTruth, pictures: Path, next_step: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Measure as TensoIR does: normals and base colour over whole pictures, and pictures under other lights.
-
-    If the true base colours are known, the run's base colours are first multiplied by one factor for each channel. The result has these
-    factors as `ratio`.
-    """
+    """Measure as TensoIR does, scaling base colours by a `ratio` for each channel."""
     found: dict[str, Any] = {}
     places = np.linspace(0, len(cameras) - 1, min(len(cameras), RATIO_VIEWS)).round().astype(int)
     chosen = [cameras[i] for i in places]
@@ -96,11 +92,7 @@ def _relit_as_tensoir(
     pictures: Path,
     next_step: Callable[[str], None],
 ) -> dict[str, float]:
-    """Compare renderings of `cameras` under another light with true pictures. Returns the mean "psnr" and "ssim".
-
-    Renderings and true pictures are sRGB-encoded, and lie over the run's background, which presets make white. Writes pictures of the
-    `chosen` cameras.
-    """
+    """Return the mean "psnr" and "ssim" under another light, and write `chosen` pictures."""
     light, rows = run.light(truth.panorama(f"relight/{hdri}")), []
     background = np.array(run.settings.image.background, np.float32)
     for camera in cameras:
@@ -118,11 +110,7 @@ def _relit_as_tensoir(
 def _stanford_orb(
     run: Run, views: list[View], truth: StanfordORBTruth, pictures: Path, next_step: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Measure as Stanford-ORB does: the test views, photos of the object in other scenes, normals and depth.
-
-    In the result, `view` holds the metrics of the test views. `light` holds those of the other scenes: the run is rendered under the light
-    of each scene. PSNR-H, the PSNR of linear radiance, is left out for photos that are not EXR files.
-    """
+    """Measure test views (`view`), other scenes (`light`), normals and depth as Stanford-ORB does."""
     with_lpips, found = metrics.lpips_missing() is None, {}
     rows: dict[str, dict[str, list[float]]] = {"view": {}, "light": {}}
     normals, depths = [], []
@@ -165,13 +153,13 @@ def _stanford_orb(
 
 
 def _mask(loaded: LoadedView) -> np.ndarray:
-    """Return the photo's mask (h, w) in 0..1. It is 1 everywhere if the photo has no mask."""
+    """Return the photo's mask (h, w) in 0..1, all 1 if it has none."""
     shape = loaded.image.shape[:2]
     return np.ones(shape) if loaded.alpha is None else loaded.alpha / 255
 
 
 def _radiance(run: Run, rendering: Rendering) -> np.ndarray:
-    """Convert a rendering's picture, which lies over the run's background, to linear radiance over black: float32 (h, w, 3)."""
+    """Convert a rendering over the run's background to linear radiance over black, (h, w, 3)."""
     alpha = rendering.alpha.numpy()[..., None]
     over = rendering.color.numpy() - np.array(run.settings.image.background, np.float32) * (1 - alpha)
     return srgb_decode(np.maximum(over, 0))
