@@ -17,6 +17,7 @@ LESS = "close other programs, or ask for less: smaller photos, fewer surfels, sm
 
 def trim() -> None:
     """Return freed memory to the system, on Linux only."""
+    # When thousands of tensors have been freed, glibc may still keep gigabytes for later.
     if sys.platform == "linux":
         release = getattr(ctypes.CDLL(None), "malloc_trim", None)  # absent in musl
         if release is not None:

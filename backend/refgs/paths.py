@@ -221,6 +221,7 @@ def check_folder(folder: Path) -> None:
 
 def check_unicode(path: Path) -> None:
     """Raise InputError if a path is not Unicode."""
+    # JSON, TOML and HTML cannot hold such a name.
     try:
         str(path.resolve()).encode()
     except UnicodeEncodeError:

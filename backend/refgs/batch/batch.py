@@ -134,6 +134,7 @@ class Batch:
 
     def _submit(self, job: Job, engine: Engine, card: int | None) -> None:
         """Submit a training's new steps; `card` is a CUDA card's memory in bytes, or None."""
+        # Steps are left out that an earlier batch has done, or that another training of the same capture has handed over.
         run = _Run(job, {node.step.name: node for node in steps_of(job, self._out, self._device)})
         self._runs[job.name] = run
         settings = job.settings()

@@ -147,6 +147,7 @@ def remove_copies(roots: list[Path], mark: Path) -> None:
 
 def _mark(root: Path) -> Path:
     """Return the path of the empty file that marks `root` as a copy."""
+    # It lies beside `root`, because the contents of a folder belong to the step.
     return root.with_name(f".{root.name}.refgs-copy")
 
 

@@ -269,6 +269,7 @@ def _remove(folder: Path, lock: FileLock) -> None:
 
 def _is_left(folder: Path) -> bool:
     """Return True if a folder looks left by a killed batch; callers test its lock."""
+    # A younger folder may belong to a batch that has not locked it yet.
     facts = folder.stat()
     own = not hasattr(os, "getuid") or facts.st_uid == os.getuid()
     return own and time.time() > facts.st_mtime + NEW and {file.name for file in folder.iterdir()} <= {LOCKED, RAY}

@@ -122,6 +122,7 @@ def _run_and_record(step: Step, cores: int) -> Outcome:
 
 def _call(step: Step, cores: int, log) -> tuple[int, str]:
     """Run a step's command, which ends with this process; return exit status and output."""
+    # The command ends when its input closes: the operating system closes it if this process is killed.
     log.write(f"$ refgs {' '.join(step.words)}\n".encode())
     log.flush()
     start = log.tell()

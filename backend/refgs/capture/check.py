@@ -107,6 +107,7 @@ def _is_inverted(inside: np.ndarray) -> bool:
 
 def _sharpness(image: np.ndarray, inside: np.ndarray) -> float:
     """Measure sharpness inside the mask, independent of contrast; a uniform image has 0."""
+    # The sum of the squared Laplacian over the sum of the squared gradient.
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     inside = cv2.erode(inside.astype(np.uint8), np.ones((7, 7), np.uint8), borderValue=(0,)) > 0
     across, down = (cv2.Sobel(grey, cv2.CV_32F, *axis, scale=1 / 8)[inside] for axis in ((1, 0), (0, 1)))

@@ -89,6 +89,7 @@ def _sorted(top: Path, pattern: str) -> list[Path]:
 
 def _is_model(folder: Path, pattern: str) -> bool:
     """Tell whether a folder has a model, even an incomplete one below `sparse`."""
+    # Reading an incomplete model raises an error that names the missing file.
     there = [any((folder / f"{name}.{end}").is_file() for end in ("bin", "txt")) for name in ("cameras", "images")]
     return any(there) if pattern.startswith("sparse") else all(there)
 
@@ -140,6 +141,7 @@ def _passed_over(model: Model, count: int) -> list[str]:
 
 def _find(photos: Files, name: str) -> Path | None:
     """Find a photo by the model's name for it. Return None if it is missing."""
+    # If COLMAP was run on the folder above that of the photos, the name begins with a folder `images` or `input`.
     first, _, rest = name.replace("\\", "/").partition("/")
     return photos.find(name) or (photos.find(rest) if fold(first) in PHOTO_FOLDERS else None)
 

@@ -206,6 +206,7 @@ def _of_code_points(primaries: int, transfer: int) -> Profile:
 @lru_cache(32)
 def _of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Profile:
     """Return the profile of a PNG's gAMA and cHRM, sRGB's if None. Raises Unusable."""
+    # The PNG specification lets encoders write a gamma of 0.45455 for sRGB's curve.
     curve = srgb_decode if not gamma or abs(gamma - 0.45455) < 5e-5 else _power(1 / gamma)  # Adobe RGB has 0.45471
     white, primaries = (chromaticities[:2], chromaticities[2:]) if chromaticities else ((), ())
     try:

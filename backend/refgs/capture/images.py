@@ -393,6 +393,8 @@ def _decoding(path: Path) -> Iterator[None]:
 
 def _decode(picture: Image.Image, path: Path, look_up: LookUp | None = None) -> Image.Image:
     """Decode a picture to 8-bit RGB, RGBA, grey, or the mode of `look_up`."""
+    # By Pillow, because OpenCV does not detect a truncated file. Grey stays one channel: a mask of 256 million pixels would take 2 GB in
+    # colour.
     with _decoding(path):
         if picture.mode.startswith("I;16"):
             values = np.asarray(picture, dtype=np.float64) / 257
@@ -412,6 +414,7 @@ def _decode(picture: Image.Image, path: Path, look_up: LookUp | None = None) -> 
 
 def _as_array(picture: Image.Image, look_up: LookUp | None) -> np.ndarray:
     """Copy a picture to uint8 (H, W, 3 | 4), converted by `look_up` if given."""
+    # In strips, because Pillow makes a temporary copy of what is copied.
     mode = "RGBA" if picture.mode == "RGBA" else "RGB"
     pixels = np.empty((picture.height, picture.width, len(mode)), np.uint8)
     for top in range(0, picture.height, ROWS):
@@ -423,6 +426,7 @@ def _as_array(picture: Image.Image, look_up: LookUp | None) -> np.ndarray:
 
 def _decode_16_bit(picture: ImageFile.ImageFile, path: Path) -> np.ndarray | None:
     """Decode a picture of over 8 bits to RGB or RGBA uint16, or return None."""
+    # By OpenCV, because Pillow keeps only the upper 8 bits of colours. Pillow first checks that the file is not truncated.
     if picture.format == "HEIF" and picture.info["bit_depth"] > 8:
         return _decode_heic(picture, path)
     tags = getattr(picture, "tag_v2", {})

@@ -179,6 +179,7 @@ def _colmap_camera(model: str, coefficients: tuple[float, ...]) -> Any:
 @lru_cache(maxsize=64)
 def _focal_factor(lens: Lens, width: int, height: int) -> float | None:
     """Return the least focal-length factor, from WIDEST to 2, without black borders, or None."""
+    # A larger factor zooms in. Below WIDEST, the centre of a fisheye photo would lose too much resolution.
     u, v = np.meshgrid(np.linspace(0, width, 65), np.linspace(0, height, 65))
 
     @np.errstate(over="ignore", invalid="ignore")

@@ -103,6 +103,7 @@ def _harmonics(directions: np.ndarray) -> np.ndarray:
 
 def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray, photos: np.ndarray) -> float:
     """Cross-validate over photos a linear model of `values` by `terms`; return the mean squared error."""
+    # Each value is a linear function of its terms, plus a constant for its point, plus one for its photo.
     total = count = 0
     for fold in range(FOLDS):
         known = photos % FOLDS != fold

@@ -41,6 +41,7 @@ def not_used(capture: Capture) -> list[str]:
 
 def _without_camera(capture: Capture, files: Files) -> list[Path]:
     """List the photos without a camera, except pictures that belong to one with a camera."""
+    # RAW files, normals and depth belong to a photo: they are in its folder, and their names begin with the photo's.
     used = {view.image_path for view in capture.views}
     stems = {(photo.parent, fold(without_suffix(photo.name))) for photo in used}
     folders = {photo.parent for photo in used}

@@ -56,6 +56,7 @@ def with_priors(views: list[View], root: Path) -> list[View]:
 
 def _find(views: list[View], root: Path, folder: Path) -> dict[View, Path]:
     """Map training views to the files in `folder` that fit by name, if any."""
+    # A file whose name fits two training photos, or only a held-out one, is not used.
     named: dict[str, list[View]] = {}
     for view in sorted(views, key=lambda view: view.split != "train"):
         parts = view.image_path.relative_to(root).parts if view.image_path.is_relative_to(root) else ()

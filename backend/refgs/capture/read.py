@@ -218,6 +218,7 @@ def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.nda
 
 def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the similarity (4, 4) from the run's frame to the capture's, and its scale."""
+    # A layout of Z_UP keeps its coordinates, unless its region is so far away, large or small that float32 is too inexact.
     if layout in Z_UP:
         if is_near(region):
             return np.eye(4), 1.0

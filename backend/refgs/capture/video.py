@@ -157,6 +157,7 @@ def _gradient(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _products(*pictures: np.ndarray) -> np.ndarray:
     """Return the matrix of the scalar products of every two pictures."""
+    # The sum of the pictures with weights w has the sum of squares w @ M @ w.
     return np.array([[np.vdot(one, other) for other in pictures] for one in pictures], np.float64)
 
 

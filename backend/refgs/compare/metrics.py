@@ -233,6 +233,7 @@ def environment_log_rmse(environment: np.ndarray, reference: np.ndarray) -> tupl
 
 def _blur(values: np.ndarray, degrees: float) -> np.ndarray:
     """Blur a panorama (h, 2h) by a Gaussian on the sphere with σ of `degrees`."""
+    # A pixel at the angle a has the weight exp((cos a − 1) / σ²).
     elevation, turn = _elevations(len(values)), 2 * np.pi / values.shape[1] * np.arange(values.shape[1])
     up, out = np.sin(elevation), np.cos(elevation)
     cosine = up[:, None, None] * up[:, None] + out[:, None, None] * out[:, None] * np.cos(turn)

@@ -54,6 +54,7 @@ def bake(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress = la
 
 def _composited(mesh: UnwrappedMesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:
     """Blend the splats at each texel, as (C, C, K) with C at most `size`."""
+    # Texels need not be finer than 1/FINE of a splat's standard deviation.
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     covered = np.abs(_cross(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0])).sum()
@@ -106,6 +107,8 @@ def _interpolate(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def _in_tangent_space(vectors: np.ndarray, *basis: np.ndarray) -> np.ndarray:
     """Convert vectors (N, 3) to unit vectors in a skewed basis: tangents, bitangents and normals."""
+    # A shader adds x·tangent + y·bitangent + z·normal. These are interpolated, so neither orthogonal nor of unit length: x, y and z solve a
+    # linear system.
     a, b, c = basis
     across = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
     volume = (a * across[:, 0]).sum(axis=1)

@@ -166,6 +166,7 @@ def _make_mesh(run: "Run", report: Report) -> "UnwrappedMesh":
 
 def _baked_splats(run: "Run", mesh: "Mesh") -> "Splats":
     """Return the run's splats for baking, without shadows in their base colours."""
+    # They have shadows if the training computed none and the light did not move relative to the object.
     from refgs.export.unshadowed import unshadowed
     from refgs.render.baselines import method_of
 

@@ -230,6 +230,7 @@ def _text_images(file: Path) -> list[Image]:
 
 def _is_image(line: str) -> bool:
     """Tell whether a line of images.txt is an image, not keypoints. Raises ValueError."""
+    # An image's line ends in the image's name. A list of keypoints has three numbers for each.
     values = line.split()
     try:
         float(values[-1])

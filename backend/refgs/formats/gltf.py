@@ -100,6 +100,7 @@ def read_glb(path: str | os.PathLike) -> Mesh:
 
 def _check_self_contained(data: bytes) -> None:
     """Raise ValueError if binary glTF refers to other files, or declares more elements than bytes."""
+    # Without this, a file could make its reader open any other file, or allocate any amount of memory.
     length, kind = struct.unpack_from("<I4s", data, 12)
     if kind != b"JSON":
         raise ValueError("it does not begin with JSON")

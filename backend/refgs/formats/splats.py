@@ -298,6 +298,7 @@ def _other_elements(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[
 
 def _without_nonfinite(splats: Splats, path: Path) -> Splats:
     """Remove nonfinite splats with an InputWarning, and in that case also other elements."""
+    # Other elements may refer to splats by row number, which has changed.
     values = {name: value for name, value in vars(splats).items() if isinstance(value, np.ndarray)}
     wrong = [name for name, value in values.items() if not np.isfinite(value).all()]
     if not wrong:

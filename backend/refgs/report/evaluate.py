@@ -144,6 +144,7 @@ def _doubt(run: Run, camera: Camera) -> np.ndarray:
 
 def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dict[str, float]]:
     """Compare the recovered with the true light, if possible, and write both as pictures."""
+    # A light that turns with the camera cannot be compared.
 
     def write(name: str, panorama: np.ndarray) -> None:
         small = metrics.resized(panorama, min(PANORAMA, len(panorama)))
