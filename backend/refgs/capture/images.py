@@ -313,6 +313,15 @@ def _stored_numbers(path: Path) -> np.ndarray | None:
     return values > (used[0] if len(used) > 1 else 0)
 
 
+def read_numbers(path: Path) -> np.ndarray | None:
+    """Read the 32-bit numbers (H, W) of a grey TIFF as float32. Return None for any other picture. Raises InputError naming the file."""
+    with _open(path) as picture:
+        if picture.mode not in ("I", "F"):
+            return None
+        with _decoding(path):
+            return np.asarray(picture, np.float32)
+
+
 def read_alpha(view: View) -> np.ndarray | None:
     """Return a photo's mask (H, W) uint8, or None if it has none. The mask has the photo's full size, and is upright but not undistorted.
 

@@ -55,11 +55,16 @@ def _of_lens(key: str) -> bool:
 
 
 class Frame(Intrinsics):
-    """Hold one camera. `transform_matrix` is its camera-to-world matrix with OpenGL's axes, (4, 4) or (3, 4)."""
+    """Hold one camera. `transform_matrix` is its camera-to-world matrix with OpenGL's axes, (4, 4) or (3, 4).
+
+    nerfstudio documents depth as millimetres, where 0 is unknown.
+    """
 
     file_path: str
     transform_matrix: Matrix
     mask_path: str | None = None
+    depth_file_path: str | None = None
+    normal_file_path: str | None = None
 
     @property
     def path(self) -> str:
