@@ -96,7 +96,7 @@ def _show_masks(number: int, capture: Path, found: dict) -> None:
     A box that the artist placed is not replaced. The new masks may move the capture's frame; the box is then moved along. `found` is the
     trainer's result of making masks. `number` is the scene's `session_uid`.
     """
-    strokes.show_masks(capture)
+    strokes.show_masks(capture, found["masks"])
     if known := _scene(number):
         box = artists_region(known)
         if box is None:
