@@ -213,7 +213,9 @@ def check_room(folder: Path) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise InputError if the folder of a capture does not exist, or if its path is not Unicode."""
+    """Raise InputError if the folder of a capture does not exist or is a file, or if its path is not Unicode."""
+    if folder.is_file():
+        raise InputError(f"{folder}: this is a file. Name the folder that holds it; refgs frames makes one of a film.")
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder. Name the folder that holds the capture.")
     check_unicode(folder)
