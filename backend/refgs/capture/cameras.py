@@ -55,18 +55,17 @@ def write_cameras(
     """
     frames = []
     for view in capture.views:
-        camera = view.camera
+        camera, mask = view.camera, _mask(view)
         factors = exposures.get(camera.name) if exposures is not None and view.split == "train" else None
         frame = {} if factors is None else {"exposure": factors if len(set(factors)) > 1 else factors[0]}
         if refined and view.split == "train":
             frame["refined"] = True
-        if (mask := _mask(view)) is not None:
-            frame["mask"] = _from(capture.folder, mask)
         frames.append(
             frame
             | {
                 "file_path": f"images/{camera.name}",
                 "photo": _from(capture.folder, view.image_path),
+                **({} if mask is None else {"mask": _from(capture.folder, mask)}),
                 "transform_matrix": (camera.camera_to_world @ OPENGL_TO_OPENCV).tolist(),
                 "fl_x": camera.fx,
                 "fl_y": camera.fy,

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import tifffile
 from PIL import ExifTags, Image, ImageFile
+from PIL.JpegImagePlugin import JpegImageFile
 from PIL.TiffImagePlugin import BITSPERSAMPLE, EXTRASAMPLES, OPEN_INFO, PHOTOMETRIC_INTERPRETATION, PLANAR_CONFIGURATION
 from pillow_heif import open_heif, register_heif_opener
 
@@ -152,7 +153,7 @@ def has_gain_map(path: Path) -> bool:
                 head = file.read(256)
             brands = head[8 : int.from_bytes(head[:4], "big")]  # ISO/IEC 14496-12, 4.3; tmap stands for gain maps
             return b"tmap" in brands or any(name.decode() in picture.info.get("aux", ()) for name in _GAIN_MAPS)
-        if picture.format not in ("JPEG", "MPO"):
+        if not isinstance(picture, JpegImageFile):
             return False
         segments = [content for _, content in picture.applist]
         with suppress(Exception):  # the other pictures are not needed, and may be broken
