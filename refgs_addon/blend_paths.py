@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 
 import bpy
 
-from .scene.camera_objects import PHOTO
+from .scene.camera_objects import MASK, PHOTO
 from .scene.capture_cameras import CAPTURE
 from .scene.run_parts import FOLDER
 from .scene.strokes import STROKES
@@ -28,7 +28,7 @@ def _change(change: Callable[[str], str]) -> None:
 def _custom_properties() -> Iterator[tuple[bpy.types.ID, str]]:
     for items in (bpy.data.collections, bpy.data.cameras, bpy.data.images):
         for item in items:
-            for key in (FOLDER, CAPTURE, PHOTO, STROKES):
+            for key in (FOLDER, CAPTURE, PHOTO, MASK, STROKES):
                 if isinstance(item.get(key), str) and item[key] and item.library is None:
                     yield item, key
 

@@ -55,6 +55,7 @@ def refgs(tmp_path, *words) -> tuple[int, str, set[str]]:
         (WRONG, "check photos", "photos: there is no such folder"),
         (WRONG, "frames film.mp4", "Missing option"),
         (WRONG, "frames film.mp4 --out capture", "film.mp4: there is no such file"),
+        (WRONG, "check full/notes.txt", "notes.txt: this is a file"),
         (WRONG, "render stopped --cameras a.json --out out --format gif", "--format gif"),
         (WRONG, "render stopped --cameras a.json --out out --passes colour", "--passes colour"),
         (WRONG, "render stopped --cameras a.json --out out", "stopped: the training has not ended"),

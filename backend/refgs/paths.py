@@ -213,7 +213,9 @@ def check_room(folder: Path) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise InputError if a capture's folder is missing or its path is not Unicode."""
+    """Raise InputError if a capture's folder is missing or a file, or its path is not Unicode."""
+    if folder.is_file():
+        raise InputError(f"{folder}: this is a file. Name the folder that holds it; refgs frames makes one of a film.")
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder. Name the folder that holds the capture.")
     check_unicode(folder)

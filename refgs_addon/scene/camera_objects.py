@@ -12,15 +12,16 @@ from ..ordinary import check_file
 
 LARGEST = 1e6  # pixels of a photo or of a focal length; Blender stores single-precision numbers
 SENSOR_WIDTH = 36.0  # mm, Blender's default
-PHOTO = "refgs_photo"  # custom property of a camera's data: the file of its photo
+# custom properties of a camera's data: the files of its photo, and of the photo's mask
+PHOTO, MASK = "refgs_photo", "refgs_mask"
 
 
 def read_cameras(path: Path, capture: Path | None) -> list[dict]:
     """Read the cameras of a cameras.json. Returns one dictionary for each photo.
 
     Each dictionary has `transform_matrix` (4 × 4, camera to world, OpenGL's axes) and the pinhole intrinsics `fl_x`, `fl_y`, `cx`, `cy`,
-    `w` and `h` in pixels. `name` is the name of the view. `photo` is the path of the photo in the folder `capture`, or "" if `capture` is
-    None. Raises InputError if the file cannot be read, or RefGS did not write it.
+    `w` and `h` in pixels. `name` is the name of the view. `photo` and `mask` are the paths of the photo and of its mask in the folder
+    `capture`, or "" if there is none or `capture` is None. Raises InputError if the file cannot be read, or RefGS did not write it.
     """
     data = read_json(path)
     try:
@@ -36,7 +37,8 @@ def read_cameras(path: Path, capture: Path | None) -> list[dict]:
             ):
                 raise ValueError
             frame["name"] = str.rpartition(frame["file_path"], "/")[2]  # a dot is a part of it
-            frame["photo"] = str(capture / frame["photo"]) if capture and "photo" in frame else ""
+            for key in ("photo", "mask"):
+                frame[key] = str(capture / frame[key]) if capture and key in frame else ""
     except (ValueError, KeyError, TypeError, OverflowError):
         raise InputError(f"{path} is not the cameras.json of a RefGS run: export the run again") from None
     return frames
@@ -70,7 +72,7 @@ def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Objec
     data.shift_y = (frame["cy"] - 0.5 * height) * aspect / width
     data["refgs_size"] = [int(width), int(height)]
     data["refgs_pixel_aspect"] = [max(1.0, 1.0 / aspect), max(1.0, aspect)]
-    data[PHOTO] = frame.get("photo", "")
+    data[PHOTO], data[MASK] = frame.get("photo", ""), frame.get("mask", "")
     camera = bpy.data.objects.new(frame["name"], data)
     camera.matrix_world = Matrix(frame["transform_matrix"])
     collection.objects.link(camera)

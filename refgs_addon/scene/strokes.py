@@ -14,7 +14,7 @@ import bpy
 from ..errors import InputError
 from ..ordinary import check_file, open_file
 from .atomic_file import atomic_write
-from .camera_objects import PHOTO
+from .camera_objects import MASK, PHOTO
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,13 +60,21 @@ def add_canvas(capture: Path, camera: bpy.types.Object) -> bpy.types.Image:
     width, height = max(1, round(width * scale)), max(1, round(height * scale))
     picture = _read_photo(photo, width, height)
     canvas = bpy.data.images.new(f"Strokes on {photo.name}", width, height, alpha=True)
-    canvas[CAPTURE], canvas[STROKES], canvas[PHOTO] = str(capture), str(file), str(photo)
+    canvas[CAPTURE], canvas[STROKES] = str(capture), str(file)
+    canvas[PHOTO], canvas[MASK] = str(photo), camera.data.get(MASK, "")
     _draw(canvas, picture, _read(file, width, height) if file.is_file() else None)
     return canvas
 
 
-def show_masks(capture: Path) -> None:
-    """Show the present masks on a capture's canvases, and keep all strokes."""
+def show_masks(capture: Path, masks: dict[str, str]) -> None:
+    """Show new masks on the canvases of a capture. All strokes stay, even unsaved ones.
+
+    `masks` maps the paths of photos in the folder `capture` to those of their masks. Cameras keep them for canvases that are made later.
+    """
+    files = {(capture / photo).resolve(): str(capture / mask) for photo, mask in masks.items()}
+    for item in (*bpy.data.cameras, *canvases()):
+        if item.get(PHOTO) and (mask := files.get(Path(item[PHOTO]).resolve())):
+            item[MASK] = mask
     for canvas in canvases():
         if canvas[CAPTURE] == str(masks_root(capture)):
             _draw(canvas, _read_photo(Path(canvas[PHOTO]), *canvas.size), _strokes(canvas))
@@ -114,22 +122,16 @@ def _name_in(capture: Path, photo: Path) -> Path:
 _SUFFIXES = {".jpg", ".jpeg", ".png", ".heic", ".tif", ".tiff", ".webp", ".bmp"}
 
 
-def _mask_file(canvas: bpy.types.Image) -> Path | None:
-    folder, name = Path(canvas[CAPTURE]), Path(canvas[STROKES]).relative_to(Path(canvas[CAPTURE], "strokes"))
-    names = (name, name.with_name(f"{name.stem}{Path(canvas[PHOTO]).suffix}.png"))
-    return next((folder / "masks" / name for name in names if (folder / "masks" / name).is_file()), None)
-
-
 def _draw(canvas: bpy.types.Image, picture: "np.ndarray", strokes: "np.ndarray | None") -> None:
-    """Fill a canvas with its photo and strokes, RGBA (height, width, 4), top row first."""
+    """Fill a canvas with the photo, red where its mask has no object, and the strokes."""
     import numpy as np
 
     width, height = canvas.size
     shown = np.ones((height, width, 4), np.float32)
     shown[..., :3] = DARKEST + (BRIGHTEST - DARKEST) * np.clip(picture[..., :3], 0, 1)
-    mask = _mask_file(canvas)
-    if mask is not None:
-        outside = _read(mask, width, height)[..., 0] < 0.5
+    mask = canvas.get(MASK)
+    if mask and Path(mask).is_file():
+        outside = _outside(_read(Path(mask), width, height))
         shown[outside, :3] = 0.4 * shown[outside, :3] + 0.6 * np.array(OUTSIDE, np.float32)
     if strokes is not None:
         drawn = strokes[..., 3] > 0.5
@@ -137,6 +139,16 @@ def _draw(canvas: bpy.types.Image, picture: "np.ndarray", strokes: "np.ndarray |
     canvas.pixels.foreach_set(np.ascontiguousarray(shown[::-1]).ravel())
     canvas.update()
     canvas.pack()
+
+
+def _outside(mask: "np.ndarray") -> "np.ndarray":
+    """Tell where a mask (H, W, 4) has no object, bool (H, W): where its alpha, if it has some, or its brightness is low.
+
+    Low is relative to the mask's own values: masks of other programs are 0 and 1 of 255, or colours of a palette.
+    """
+    values = mask[..., 3] if mask[..., 3].min() < 1 else mask[..., :3].max(axis=2)
+    low, high = values.min(), values.max()
+    return values <= ((low if low < high else 0) + high) / 2
 
 
 def _strokes(canvas: bpy.types.Image) -> "np.ndarray":

@@ -95,7 +95,7 @@ def make_masks(scene: bpy.types.Scene) -> jobs.Job:
 
 def _show_masks(number: int, capture: Path, found: dict) -> None:
     """Show new masks, and move the scene's training box by the trainer's result `found`."""
-    strokes.show_masks(capture)
+    strokes.show_masks(capture, found["masks"])
     if known := _scene(number):
         box = artists_region(known)
         if box is None:

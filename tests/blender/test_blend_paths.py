@@ -23,7 +23,7 @@ def project(addon, tmp_path):
     (folder / "run.toml").write_text(f"[run]\ncapture = {json.dumps(str(top / 'photos'))}\n")
     data = json.loads((folder / "cameras.json").read_text())
     for frame in data["frames"]:
-        frame["photo"] = "images/0001.jpg"
+        frame["photo"], frame["mask"] = "images/0001.jpg", "mask/0001.png"
     (folder / "cameras.json").write_text(json.dumps(data))
     import_run(folder, addon)
     addon.refgs.capture, addon.refgs.out = str(top / "photos"), ""
@@ -40,6 +40,7 @@ def stored() -> dict[str, str]:
     return {
         "run": collection[FOLDER],
         "photo": bpy.data.cameras[0]["refgs_photo"],
+        "mask": bpy.data.cameras[0]["refgs_mask"],
         "capture": settings.capture,
         "out": settings.out,
         "known": settings.runs[0].folder,
@@ -50,7 +51,8 @@ def stored() -> dict[str, str]:
 def expected(top) -> dict[str, str]:
     photos, run = str(top / "photos"), str(top / "runs" / "pot")
     photo = str(top / "photos" / "images" / "0001.jpg")
-    return {"run": run, "photo": photo, "capture": photos, "out": "", "known": run, "trained": photos}
+    mask = str(top / "photos" / "mask" / "0001.png")
+    return {"run": run, "photo": photo, "mask": mask, "capture": photos, "out": "", "known": run, "trained": photos}
 
 
 def test_a_copied_project_works_in_its_own_run(project, tmp_path):
@@ -72,6 +74,7 @@ def test_paths_in_the_file_are_relative(project):
     found = stored()
     blend_paths.register()
     assert found["run"] == "//runs/pot" and found["capture"] == found["trained"] == "//photos"
+    assert found["mask"] == "//photos/mask/0001.png"
     assert found["photo"] == "//photos/images/0001.jpg" and found["known"] == "//runs/pot"
 
 

@@ -228,6 +228,42 @@ def test_photos_that_cannot_be_painted_on(addon, capture, tmp_path):
     assert not strokes.canvases()
 
 
+def half(kind: str, path: Path) -> None:
+    """Write a mask whose right half is the object."""
+    right = np.zeros((HEIGHT, WIDTH), np.uint8)
+    right[:, WIDTH // 2 :] = 1
+    if kind == "palette":
+        picture = Image.fromarray(right, "P")
+        picture.putpalette([0, 0, 0, 0, 0, 128])
+    elif kind == "alpha":
+        picture = Image.fromarray(np.dstack([np.full((HEIGHT, WIDTH, 3), 255, np.uint8), 255 * right]))
+    else:
+        picture = Image.fromarray(right * {"white": 255, "zero and one": 1}[kind])
+    picture.save(path)
+
+
+@pytest.mark.parametrize("kind", ["white", "zero and one", "palette", "alpha"])
+def test_a_canvas_shows_the_mask_that_the_trainer_found(addon, capture, tmp_path, kind):
+    Image.fromarray(np.full((HEIGHT, WIDTH, 3), 128, np.uint8)).save(capture / "images" / "a.jpg")
+    (capture / "Mask").mkdir()
+    half(kind, capture / "Mask" / "mask_a.png")
+    lens = {"fl_x": 90.0, "fl_y": 90.0, "cx": 32.0, "cy": 24.0, "w": WIDTH, "h": HEIGHT}
+    files = {"file_path": "images/a", "photo": "images/a.jpg", "mask": "Mask/mask_a.png"}
+    frame = files | lens | {"transform_matrix": np.eye(4).tolist()}
+    (tmp_path / "cameras.json").write_text(json.dumps({"frames": [frame]}))
+    (camera,) = show_cameras(addon, capture, tmp_path / "cameras.json").objects
+    canvas = strokes.add_canvas(capture, camera)
+    red = pixels_of(canvas)[..., 0] - pixels_of(canvas)[..., 1] > 0.2
+    assert red[:, : WIDTH // 2].all() and not red[:, WIDTH // 2 :].any()
+    # A mask that the trainer made takes its place, on canvases that are made later, too.
+    (capture / "masks").mkdir()
+    Image.fromarray(np.full((HEIGHT, WIDTH), 255, np.uint8)).save(capture / "masks" / "a.png")
+    strokes.show_masks(capture, {"images/a.jpg": "masks/a.png"})
+    assert np.ptp(pixels_of(canvas)[..., :3]) < 0.05
+    bpy.data.images.remove(canvas)
+    assert np.ptp(pixels_of(strokes.add_canvas(capture, camera))[..., :3]) < 0.05
+
+
 @pytest.mark.parametrize(("paints", "color"), [("object", 1), ("rest", 0), ("nothing", 1)])
 def test_brushes(addon, paints, color):
     assert bpy.ops.refgs.choose_brush(paints=paints) == {"FINISHED"}

@@ -41,6 +41,8 @@ def refused(read, *parts: str) -> None:
 
 def test_no_such_folder(tmp_path):
     refused(lambda: read_capture(tmp_path / "nowhere"), "nowhere", "no such folder")
+    (tmp_path / "film.mp4").touch()
+    refused(lambda: read_capture(tmp_path / "film.mp4"), "film.mp4: this is a file", "refgs frames")
 
 
 def test_folder_without_a_capture(tmp_path):

@@ -1,11 +1,13 @@
 """Test camera files: write and read a run folder's cameras.json, and read cameras from a capture's transforms file."""
 
+import json
+
 import numpy as np
 import pytest
 
 from refgs.capture import read_cameras, read_capture, read_run_cameras, write_cameras
 from refgs.capture.poses import in_frame
-from tests.makers.captures import colmap, nerf_blender, nerfstudio
+from tests.makers.captures import colmap, edit, nerf_blender, nerfstudio, nero, write
 
 
 def assert_same(a, b):
@@ -33,6 +35,29 @@ def test_run_cameras_round_trip(tmp_path, make):
     # Read as a camera path, the same file is in the capture's frame.
     for camera, view in zip(read_cameras(file), capture.views, strict=True):
         assert_same(camera, in_frame(view.camera, capture.to_capture))
+
+
+def test_photos_and_their_masks_are_named(tmp_path):
+    folder = nerfstudio(tmp_path / "capture")
+    for name in ("mask/0001.png.mask.png", "masks/0002.jpg", "silhouettes/3.png"):
+        write(folder / name, np.tri(48, 64, dtype=np.uint8) * 255)
+    (tmp_path / "other.png").write_bytes((folder / "masks" / "0002.jpg").read_bytes())
+    edit(folder / "transforms.json", lambda data: data["frames"][3].update(mask_path="silhouettes/3.png"))
+    edit(folder / "transforms.json", lambda data: data["frames"][4].update(mask_path="../other.png"))
+    write_cameras(tmp_path / "cameras.json", read_capture(folder))
+    frames = json.loads((tmp_path / "cameras.json").read_text())["frames"]
+    assert [frame["photo"] for frame in frames] == [f"images/{i:04d}.png" for i in range(16)]
+    assert {frame["photo"][7:11]: frame["mask"] for frame in frames if "mask" in frame} == {
+        "0001": "mask/0001.png.mask.png",
+        "0002": "masks/0002.jpg",
+        "0003": "silhouettes/3.png",
+        "0004": "../other.png",
+    }
+
+
+def test_depth_maps_are_named_as_no_masks(tmp_path):
+    write_cameras(tmp_path / "cameras.json", read_capture(nero(tmp_path / "bell")))
+    assert "mask" not in (tmp_path / "cameras.json").read_text()
 
 
 @pytest.mark.parametrize(("make", "name"), [(nerf_blender, "transforms_test.json"), (nerfstudio, "transforms.json")])

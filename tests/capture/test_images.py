@@ -17,10 +17,19 @@ from refgs.camera import Camera
 from refgs.capture import View, load_view, read_capture
 from refgs.capture.check import check
 from refgs.capture.files import find_photos
-from refgs.capture.images import read_codes, read_focal_length, read_header, read_image, read_mask, write_for_colmap
+from refgs.capture.images import (
+    has_gain_map,
+    read_codes,
+    read_focal_length,
+    read_header,
+    read_image,
+    read_mask,
+    write_for_colmap,
+)
 from refgs.color import srgb_decode
 from refgs.errors import InputError
 from refgs.formats.exr import write_exr
+from tests.makers import gain_maps
 from tests.makers.captures import colmap, edit, nerf_blender, nerfstudio, write, write_as_phone
 from tests.makers.dng import write_dng
 
@@ -654,3 +663,30 @@ def test_exr_photos_in_another_unit(tmp_path, factor, said):
     (folder / "transforms.json").write_text(text)
     (line,) = (line for line in check(read_capture(folder), tmp_path / "out")["lines"] if "EXR" in line)
     assert said in line and "factor" in line
+
+
+@pytest.mark.parametrize("name", gain_maps.WITH)
+def test_the_standard_picture_of_a_photo_with_a_gain_map_is_read(tmp_path, name):
+    gain_maps.WITH[name](tmp_path / name)
+    assert has_gain_map(tmp_path / name)
+    assert read_header(tmp_path / name)[:2] == (gain_maps.WIDTH, gain_maps.HEIGHT)
+    image, alpha = read_image(tmp_path / name)
+    assert image.shape == (gain_maps.HEIGHT, gain_maps.WIDTH, 3) and alpha is None
+    # JPEGs have a profile: these codes of Display P3 are those of sRGB.
+    expected = (216, 93, 24) if name.endswith(".jpg") else gain_maps.CODE
+    np.testing.assert_allclose(image, np.broadcast_to(expected, image.shape), atol=3)
+    small = read_image(tmp_path / name, shrink=4)[0]
+    assert small.shape[0] in (gain_maps.HEIGHT // 4, gain_maps.HEIGHT) and np.ptp(small, axis=(0, 1)).max() <= 2
+
+
+@pytest.mark.parametrize("name", gain_maps.WITHOUT)
+def test_photos_without_a_gain_map(tmp_path, name):
+    gain_maps.WITHOUT[name](tmp_path / name)
+    assert not has_gain_map(tmp_path / name)
+
+
+def test_a_broken_second_picture_hides_no_photo(tmp_path):
+    gain_maps.WITH["ISO 21496-1.jpg"](tmp_path / "a.jpg")
+    data = (tmp_path / "a.jpg").read_bytes()
+    (tmp_path / "a.jpg").write_bytes(data[: data.rindex(b"\xff\xd8\xff") + 8])
+    assert not has_gain_map(tmp_path / "a.jpg") and read_image(tmp_path / "a.jpg")[0].shape == (48, 64, 3)

@@ -102,6 +102,7 @@ def test_masks_are_the_silhouettes_and_the_capture_has_them(tmp_path):
     assert (found["made"], found["kept"], found["objects"]) == (COUNT, 0, 1)
     assert min(overlap(read_masks(tmp_path), truths)) > 0.9
     assert read_capture(tmp_path).masked
+    assert found["masks"] == {f"images/{i:04d}.png": f"masks/{i:04d}.png" for i in range(COUNT)}
     assert set(heard) == {"region", "points", "reading", "carving", "edges"}
     assert not (tmp_path / "masks.tmp").exists()
 

@@ -249,6 +249,11 @@ def test_a_photo_that_is_broken(tmp_path):
 def test_no_photos(tmp_path):
     with pytest.raises(InputError, match="0 photos"):
         find_cameras(tmp_path, quiet)
+    (tmp_path / "a.jpg").touch()
+    with pytest.raises(InputError, match=r"a\.jpg: this is a file\. Name the folder that holds it"):
+        find_cameras(tmp_path / "a.jpg", quiet)
+    with pytest.raises(InputError, match="nowhere: there is no such folder"):
+        find_cameras(tmp_path / "nowhere", quiet)
 
 
 def test_what_stands_still_contradicts_what_turns():

@@ -1,6 +1,7 @@
 """Test that `refgs check` says what of a capture is not used."""
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from refgs.capture import find_layout, read_capture
 from refgs.capture.check import describe
 from refgs.capture.not_used import not_used
+from tests.makers import gain_maps
 from tests.makers.captures import (
     colmap,
     edit,
@@ -50,6 +52,18 @@ def test_a_photo_whose_frame_was_removed(tmp_path):
 @pytest.mark.parametrize("make", [nerf_blender, nerfstudio, colmap, nero, tensoir, stanford_orb, shiny_blender])
 def test_nothing_is_said_of_a_whole_capture(tmp_path, make):
     assert not_used(read_capture(make(tmp_path / "a" / "b"))) == []
+
+
+def test_gain_maps_are_said_once(tmp_path):
+    folder = nerfstudio(tmp_path)
+    names = {2: "Ultra HDR.jpg", 3: "Apple.heic", 5: "with a preview.jpg"}
+    for number, name in names.items():
+        (folder / "images" / f"{number:04d}.png").unlink()
+        (gain_maps.WITH | gain_maps.WITHOUT)[name](folder / "images" / f"{number:04d}{Path(name).suffix}")
+    lines = describe(read_capture(folder))
+    assert [line for line in lines if "gain map" in line] == [
+        "Not used: the HDR gain maps of 2 photos, first images/0002.jpg: they are read as the standard picture"
+    ]
 
 
 def test_masks_of_no_photo(tmp_path):

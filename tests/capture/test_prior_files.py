@@ -143,7 +143,7 @@ def test_files_are_undistorted_as_their_photos(tmp_path):
     assert np.abs(prior.values - straight)[inner].max() < 0.01 < np.abs(distorted - straight)[inner].max()
 
 
-@pytest.mark.parametrize("name", ["a.png", "a.npy", "a.npz", "a.exr"])
+@pytest.mark.parametrize("name", ["a.png", "a.npy", "a.npz", "a.exr", "a.tif"])
 def test_depth_is_read_from_each_format(tmp_path, name):
     nerfstudio(tmp_path)
     depth = np.tile(np.linspace(0.2, 0.9, WIDTH, dtype=np.float32), (HEIGHT, 1))
@@ -206,3 +206,47 @@ def test_the_check_counts_them(tmp_path):
     put(tmp_path, "depth/0001.npy", 1.0 + slopes()[..., 0])
     lines = describe(read_capture(tmp_path))
     assert "Normals: for 2 of 14 views to train on" in lines and "Depth: for 1 of 14 views to train on" in lines
+
+
+def test_files_that_the_cameras_name(tmp_path):
+    """Check nerfstudio's depth: 16 bits, millimetres, 0 is unknown. Names may be another machine's; other files are ignored."""
+    nerfstudio(tmp_path)
+    depth = np.tile(np.linspace(1500, 3500, WIDTH).astype(np.uint16), (HEIGHT, 1))
+    depth[:10] = 0
+    put(tmp_path, "sensor/a.png", depth)
+    put(tmp_path, "sensor/b.tiff", depth.astype(np.float32))
+    put(tmp_path, "n/a.png", encoded(slopes()))
+    touch(tmp_path, "depth/0001.png", "depth/0004.npy", "normals/0002.png", "sensor/c.npy.gz")
+
+    def name_them(data):
+        for number, name in (
+            (1, "./sensor/a.png"),
+            (2, "/data/them/Sensor/b.tiff"),
+            (3, "sensor/c.npy.gz"),
+            (8, "sensor/a.png"),
+        ):
+            data["frames"][number]["depth_file_path"] = name
+        data["frames"][1]["normal_file_path"] = "n/a.png"
+        data["frames"][5]["depth_file_path"] = "/data/images/0005.png"  # a photo is no depth
+        data["frames"][6]["normal_file_path"] = None
+
+    edit(tmp_path / "transforms.json", name_them)
+    capture = read_capture(tmp_path)
+    views = {view.camera.name: view for view in capture.views}
+    assert {name: view.prior_depth.name for name, view in views.items() if view.prior_depth} == {
+        "0001": "a.png",
+        "0002": "b.tiff",
+        "0004": "0004.npy",
+    }
+    assert {name: view.prior_normals.parent.name for name, view in views.items() if view.prior_normals} == {
+        "0001": "n",
+        "0002": "normals",
+    }
+    assert capture.warnings == [
+        "2 of the 6 files of depth or normals that transforms.json names are missing, or of a format that is not read: "
+        "first sensor/c.npy.gz"
+    ]
+    for name, unit in (("0001", 65535), ("0002", 1)):
+        prior = load_depth(views[name])
+        np.testing.assert_allclose(prior.values * unit, depth, atol=0.01)
+        assert prior.known[10:].all() and not prior.known[:10].any()

@@ -79,7 +79,8 @@ def made_masks(command):
     """Describe where the object is, and how masks move the frame."""
     box = ["region.centre=[1.0, 0.0, 0.0]", "region.size=[1.0, 2.0, 4.0]"]
     moved = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 1], [0, 0, 0, 1]]
-    return {"capture": command["capture"], "region": box, "moved": moved}
+    masks = {f"images/{photo.name}": f"masks/{photo.stem}.png" for photo in Path(command["capture"]).glob("images/*")}
+    return {"capture": command["capture"], "region": box, "moved": moved, "masks": masks}
 
 
 def hold(asked):

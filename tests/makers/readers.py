@@ -397,6 +397,10 @@ READERS: dict[str, Reader] = {
     "depth of an EXR": Reader(
         lambda f: write_exr(f / "a.exr", PHOTO[..., 0] / 3.0), "a.exr", "bytes", lambda f: load_depth(_view(f, prior_depth=f / "a.exr"))
     ),
+    "depth of a TIFF": Reader(
+        lambda f: captures.write(f / "a.tif", np.float32(PHOTO[..., 0])), "a.tif", "bytes",
+        lambda f: load_depth(_view(f, prior_depth=f / "a.tif")),
+    ),
     "maps of Stanford-ORB": Reader(
         lambda f: captures.stanford_orb(f, side=16), "ground_truth/ball_scene001/surface_normal/0000.npy", "bytes",
         lambda f: StanfordORBTruth(f / "blender_HDR" / "ball_scene001", np.eye(4)).maps(

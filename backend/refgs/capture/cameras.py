@@ -10,7 +10,7 @@ from refgs.capture.files import PHOTO_FOLDERS, Files
 from refgs.capture.images import read_header
 from refgs.capture.poses import OPENGL_TO_OPENCV, in_frame
 from refgs.capture.transforms import frame_camera, where
-from refgs.capture.types import Capture
+from refgs.capture.types import Capture, View
 from refgs.errors import InputError
 from refgs.formats.transforms import read_run_transforms, read_transforms
 from refgs.paths import write_text
@@ -54,7 +54,7 @@ def write_cameras(
     """
     frames = []
     for view in capture.views:
-        camera = view.camera
+        camera, mask = view.camera, _mask(view)
         factors = exposures.get(camera.name) if exposures is not None and view.split == "train" else None
         frame = {} if factors is None else {"exposure": factors if len(set(factors)) > 1 else factors[0]}
         if refined and view.split == "train":
@@ -63,7 +63,8 @@ def write_cameras(
             frame
             | {
                 "file_path": f"images/{camera.name}",
-                "photo": _from(capture.folder, view.image_path).as_posix(),
+                "photo": _from(capture.folder, view.image_path),
+                **({} if mask is None else {"mask": _from(capture.folder, mask)}),
                 "transform_matrix": (camera.camera_to_world @ OPENGL_TO_OPENCV).tolist(),
                 "fl_x": camera.fx,
                 "fl_y": camera.fy,
@@ -80,8 +81,17 @@ def write_cameras(
     write_text(file, json.dumps(facts, indent=1))
 
 
-def _from(folder: Path, file: Path) -> Path:
-    return file.relative_to(folder) if file.is_relative_to(folder) else file
+def mask_names(folder: Path, views: list[View]) -> dict[str, str]:
+    """Return the mask file of each photo that has one, by the photo's path. Paths are relative to the capture's `folder`, if in it."""
+    return {_from(folder, v.image_path): _from(folder, mask) for v in views if (mask := _mask(v)) is not None}
+
+
+def _mask(view: View) -> Path | None:
+    return view.mask_path if view.mask_below is None else None  # not a depth map
+
+
+def _from(folder: Path, file: Path) -> str:
+    return (file.relative_to(folder) if file.is_relative_to(folder) else file.absolute()).as_posix()
 
 
 def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, list[float | list[float]], bool]:

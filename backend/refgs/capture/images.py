@@ -7,7 +7,7 @@ white stand for brighter radiance.
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import tifffile
 from PIL import ExifTags, Image, ImageFile
+from PIL.JpegImagePlugin import JpegImageFile
 from PIL.TiffImagePlugin import BITSPERSAMPLE, EXTRASAMPLES, OPEN_INFO, PHOTOMETRIC_INTERPRETATION, PLANAR_CONFIGURATION
 from pillow_heif import open_heif, register_heif_opener
 
@@ -38,6 +39,7 @@ from refgs.formats.pixels import (
     decode,
 )
 from refgs.memory import is_shortage
+from refgs.paths import open_file
 
 register_heif_opener()  # Pillow opens HEIC then
 # It lacks big-endian greyscale TIFF with 16 bits in which 0 is white. `_decode_16_bit` inverts what it reads.
@@ -63,6 +65,14 @@ FORMATS = {
     "TGA": (".tga",),
     "GIF": (".gif",),
 }
+
+# Names of gain maps: Ultra HDR's in XMP, that of ISO 21496-1 in a segment APP2, Apple's in XMP and HEIC.
+_GAIN_MAPS = (
+    b"http://ns.adobe.com/hdr-gain-map/",
+    b"urn:iso:std:iso:ts:21496:-1",
+    b"urn:com:apple:photo:2020:aux:hdrgainmap",
+)
+_PICTURES = 4  # in a JPEG whose headers are read; phones write two or three
 
 ROWS = 128  # that are copied from a decoded picture at a time
 
@@ -128,6 +138,29 @@ def read_header(path: Path) -> Header:
         return Header(*read_exr_header(path), 0)
     with _open(path) as picture:
         return Header(*picture.size, picture.has_transparency_data, _turns(picture))
+
+
+def has_gain_map(path: Path) -> bool:
+    """Tell whether a JPEG or HEIC holds a gain map, with which viewers make the photo brighter than white. No pixels are decoded.
+
+    `read_image` does not use it. Raises InputError naming the file.
+    """
+    if _is_raw(path) or _is_exr(path):
+        return False
+    with _open(path) as picture:
+        if picture.format == "HEIF":
+            with open_file(path) as file:
+                head = file.read(256)
+            brands = head[8 : int.from_bytes(head[:4], "big")]  # ISO/IEC 14496-12, 4.3; tmap stands for gain maps
+            return b"tmap" in brands or any(name.decode() in picture.info.get("aux", ()) for name in _GAIN_MAPS)
+        if not isinstance(picture, JpegImageFile):
+            return False
+        segments = [content for _, content in picture.applist]
+        with suppress(Exception):  # the other pictures are not needed, and may be broken
+            for number in range(1, min(getattr(picture, "n_frames", 1), _PICTURES)):
+                picture.seek(number)
+                segments += [content for _, content in picture.applist]
+    return any(name in content for name in _GAIN_MAPS for content in segments)
 
 
 def read_focal_length(path: Path) -> float | None:
@@ -283,6 +316,15 @@ def _stored_numbers(path: Path) -> np.ndarray | None:
     if np.ptp(shown, axis=1).max() == 0 and len(np.unique(shown, axis=0)) == len(used):
         return None  # grey
     return values > (used[0] if len(used) > 1 else 0)
+
+
+def read_numbers(path: Path) -> np.ndarray | None:
+    """Read the 32-bit numbers (H, W) of a grey TIFF as float32. Return None for any other picture. Raises InputError naming the file."""
+    with _open(path) as picture:
+        if picture.mode not in ("I", "F"):
+            return None
+        with _decoding(path):
+            return np.asarray(picture, np.float32)
 
 
 def read_alpha(view: View) -> np.ndarray | None:

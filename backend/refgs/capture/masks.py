@@ -23,6 +23,7 @@ from refgs.camera import Camera
 from refgs.capture import View, load_view, read_files, to_run_frame
 from refgs.capture.backdrop import Backdrop, find_plane
 from refgs.capture.box import Box
+from refgs.capture.cameras import mask_names
 from refgs.capture.colmap import capture_root
 from refgs.capture.images import read_image
 from refgs.capture.lens import Lens
@@ -62,6 +63,7 @@ def make_masks(
 
     - `photos`, `made`, `kept`: the numbers of photos, of new masks and of kept masks.
     - `objects`: the number of separate objects.
+    - `masks`: the mask file of each photo that has one, by the photo's path. Paths are in the capture's folder, or absolute.
     - `region`: the box around the objects, as settings for a training with the new masks.
     - `moved`: a matrix (4, 4), as a list of rows: p_new = moved @ p. The run's frame (the world coordinates of training) depends on the
       masks. The matrix maps points from the frame with the earlier masks to the frame with the new masks.
@@ -161,6 +163,7 @@ def with_masks(
         "made": len(targets),
         "kept": len(views) - len(targets),
         "objects": shape.objects,
+        "masks": mask_names(folder, given),
         "region": region_settings(shape.bounds(to_frame)),
         "moved": to_frame.tolist(),
     }

@@ -40,7 +40,7 @@ from refgs.capture.images import read_header, read_mask
 from refgs.capture.mask_files import find_masks
 from refgs.capture.region import WHITE_MASKS, empty_masks
 from refgs.errors import InputError
-from refgs.paths import check_room, disk_errors_named
+from refgs.paths import check_folder, check_room, disk_errors_named
 
 UNEXPLAINED = 0.2  # part of the matches, above which the cameras are not trusted
 DOUBTED = "as happens if an object turns in front of still surroundings: look at the cameras before you train (Show Cameras in Blender)"
@@ -84,11 +84,12 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
     - "progress": the dict `facts` has `stage` ("features", "matching" or "mapping"), `done` and `total`.
     - "warning": the dict `facts` has the text `what`.
 
-    An interrupted call leaves `sparse.tmp`. The next call for the same photos resumes from it. Raises InputError if there are fewer than
-    three photos, if all masks are empty, if there are cameras already, if fewer than half of the photos got a camera, or if the photos fall
-    into two large groups without common features.
+    An interrupted call leaves `sparse.tmp`. The next call for the same photos resumes from it. Raises InputError if there is no such
+    folder, if there are fewer than three photos, if all masks are empty, if there are cameras already, if fewer than half of the photos got
+    a camera, or if the photos fall into two large groups without common features.
     """
     folder = Path(folder)
+    check_folder(folder)
     photos = find_photos(folder)
     if len(photos) < 3:
         raise InputError(

@@ -1,10 +1,11 @@
-"""Find files in a capture's folder that look as if they belonged to it, but are not used."""
+"""Find files in a capture's folder that look as if they belonged to it, and parts of its photos, that are not used."""
 
 import re
 from pathlib import Path
 
 from refgs.capture.colmap import capture_root
 from refgs.capture.files import PHOTO_FOLDERS, Files, fold, photos_in, without_suffix
+from refgs.capture.images import has_gain_map
 from refgs.capture.mask_files import mask_folders
 from refgs.capture.region import WHITE_MASKS
 from refgs.capture.types import Capture
@@ -13,14 +14,18 @@ _LIKE_MASKS = re.compile(r"mask|matte|alpha|silhouette|segment", re.IGNORECASE)
 
 
 def not_used(capture: Capture) -> list[str]:
-    """List the photos without a camera, the masks that belong to no photo, and the masks in folders that are not read.
+    """List photos without a camera, gain maps, masks that belong to no photo, and masks in folders that are not read.
 
-    Returns a line of text for each kind, with the number of files and an example. Returns [] if there are no such files.
+    Returns a line of text for each kind, with the number of files and an example. Returns [] if there are no such files. Raises InputError
+    naming a photo whose header cannot be read.
     """
     files = Files(capture_root(capture.folder, capture.layout))
     lines = []
     if capture.layout != "tensoir" and (photos := _without_camera(capture, files)):
         lines.append(f"{_count(photos, 'photo')} without a camera, first {_name(files, photos[0])}")
+    if photos := [view.image_path for view in capture.views if has_gain_map(view.image_path)]:
+        what = f"the HDR gain maps of {_count(photos, 'photo')}, first {_name(files, photos[0])}"
+        lines.append(f"{what}: they are read as the standard picture")
     if WHITE_MASKS in capture.warnings:  # no view has its mask then
         return lines
     used = {view.mask_path for view in capture.views}

@@ -1,7 +1,8 @@
 """Read priors: normals and depth that other programs guessed from single photos. Training uses them only early.
 
 Priors are files in the folders `normals` and `depth`, beside the folder `masks`. A prior has the name of its photo, like a mask. Words that
-the other program appended to the name are ignored, as in `0001_pred.npy` for the photo `0001.jpg`.
+the other program appended to the name are ignored, as in `0001_pred.npy` for the photo `0001.jpg`. A JSON file of cameras may name them,
+too. Measured depth, as nerfstudio's files have, is used like guessed depth.
 """
 
 import re
@@ -14,7 +15,7 @@ import numpy as np
 
 from refgs.camera import Camera
 from refgs.capture.files import PICTURE_SUFFIXES, Files, fold
-from refgs.capture.images import read_codes
+from refgs.capture.images import read_codes, read_numbers
 from refgs.capture.reduce import reduced_map
 from refgs.capture.types import View
 from refgs.errors import InputError
@@ -42,15 +43,16 @@ class Prior(NamedTuple):
 
 
 def with_priors(views: list[View], root: Path) -> list[View]:
-    """Add the paths of priors to the training views. The folder `root` has the folders `normals` and `depth`, if there are priors.
+    """Add the paths of priors to the training views that have none yet, and remove those of the others.
 
-    No file is opened. A file whose name fits no photo is ignored.
+    Priors are in the folders `normals` and `depth` of the folder `root`. No file is opened. A file whose name fits no photo is ignored.
     """
     files = Files(root)
     for name, field in FOLDERS.items():
-        if (folder := files.find_folder(name)) is not None:
-            found = _find(views, root, folder)
-            views = [replace(view, **{field: found.get(view)}) for view in views]
+        folder = files.find_folder(name)
+        found = {} if folder is None else _find(views, root, folder)
+        priors = [(getattr(view, field) or found.get(view)) if view.split == "train" else None for view in views]
+        views = [replace(view, **{field: prior}) for view, prior in zip(views, priors, strict=True)]
     return views
 
 
@@ -120,13 +122,16 @@ def load_depth(view: View) -> Prior | None:
 def _read(path: Path, channels: int) -> np.ndarray:
     """Read a prior's file as float32: (H, W, 3) if `channels` is 3, or (H, W) if it is 1.
 
-    Integers are divided by the largest value of their type. Values that are not finite become 0, and so do transparent pixels.
+    Integers are divided by the largest value of their type, but 32-bit ones of a TIFF are as they are. Values that are not finite become
+    0, and so do transparent pixels.
     """
     if path.suffix.lower() in (".npy", ".npz"):
         values = _read_array(path, channels)
     elif path.suffix.lower() == ".exr":
         values = read_exr(path, is_data=True)
         values = values[..., :3] if values.ndim == 3 else values[..., None]
+    elif (numbers := read_numbers(path)) is not None:
+        values = numbers[..., None]
     else:
         codes, alpha, white = read_codes(path, is_data=True)
         values = codes.astype(np.float32) / white

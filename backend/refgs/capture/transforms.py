@@ -4,6 +4,7 @@ Poses are camera-to-world with OpenGL's axes, or with those that the key `camera
 """
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,9 @@ from refgs.capture.images import read_header
 from refgs.capture.lens import BROWN, Lens, check_intrinsics
 from refgs.capture.mask_files import find_masks
 from refgs.capture.poses import OPENGL_TO_OPENCV, world_to_camera
+from refgs.capture.priors import SUFFIXES
 from refgs.capture.types import Split, View
-from refgs.errors import InputError
+from refgs.errors import InputError, one_line
 from refgs.formats.colmap import PARAMETERS
 from refgs.formats.transforms import Frame
 
@@ -104,20 +106,31 @@ def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> tuple[list[View
     """Make a view (a photo with its camera) of each frame whose photo is there. Return them, and warnings of what was left out.
 
     Cameras are in the file's coordinates; photo paths are relative to its folder. `frames` are pairs of a frame and its split, "train" or
-    "test". Raises InputError.
+    "test". A frame's files of depth and normals are priors (see `capture/priors.py`), which need not be there. Raises InputError.
     """
     files = Files(file.parent)
     named = [(pair, pair[0].path, files.find(pair[0].path, *PHOTO_FOLDERS)) for pair in frames]
     found, warnings = leave_out_missing(file, named)
     masks = find_masks(files, [image for (frame, _), image in found if not frame.mask_path])
-    views = []
+    photos = {image for _, image in found}
+    views, priors, absent = [], 0, []
     for (frame, split), image in found:
         at = where(file, frame)
         mask = masks.get(image)
         if frame.mask_path and (mask := files.find(frame.mask_path, "masks")) is None:
             raise InputError(f"{at}: the mask {frame.mask_path} is missing. Put it back, or remove its mask_path.")
         camera = frame_camera(frame, at, read_header(image)[:2])
-        views.append(photo_view(image, camera, split, mask, at))
+        view = photo_view(image, camera, split, mask, at)
+        for field, name in (("prior_depth", frame.depth_file_path), ("prior_normals", frame.normal_file_path)):
+            if name:
+                prior = files.find(name, suffixes=False)
+                usable = prior is not None and prior not in photos and prior.suffix.lower() in SUFFIXES
+                view, priors = replace(view, **{field: prior if usable else None}), priors + 1
+                absent += [] if usable else [name]
+        views.append(view)
+    if absent:
+        what = f"{len(absent)} of the {priors} files of depth or normals that {file.name} names"
+        warnings.append(one_line(f"{what} are missing, or of a format that is not read: first {absent[0]}"))
     return views, warnings
 
 

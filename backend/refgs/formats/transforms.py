@@ -55,11 +55,16 @@ def _of_lens(key: str) -> bool:
 
 
 class Frame(Intrinsics):
-    """Hold one camera; `camera_convention`, or else OpenGL, names the axes of its camera-to-world matrix."""
+    """Hold one camera; `camera_convention`, or else OpenGL, names the axes of its camera-to-world matrix.
+
+    nerfstudio documents depth as millimetres, where 0 is unknown.
+    """
 
     file_path: str
     transform_matrix: Matrix
     mask_path: str | None = None
+    depth_file_path: str | None = None
+    normal_file_path: str | None = None
 
     @property
     def path(self) -> str:
