@@ -198,7 +198,7 @@ def damage_folder(folder: Path, dice: random.Random) -> None:
                 with suppress(ValueError):  # another file's content is in it
                     file.write_text(json.dumps(_other_poses(json.loads(file.read_text()), dice)))
             case _ if file.suffix == ".txt":
-                words = re.split(r"(\s+)", file.read_text())
+                words = re.split(r"(\s+)", file.read_text(errors="replace"))
                 numbers = [i for i, word in enumerate(words) if re.fullmatch(r"-?\d.*", word)]
                 for i in dice.sample(numbers, min(len(numbers), dice.choice((1, 1, 9)))):
                     words[i] = str(dice.choice(EXTREMES))
