@@ -2,6 +2,8 @@
 
 Each scene is a module with a function `build()`, and is rendered by Blender's Cycles. `solids` helps to model the meshes. `scripts.demo`
 places cameras and renders the photos. `lights` makes soft lights. `analytic` makes simpler captures without Blender.
+
+`can` and `tabletop` are commands of their own. They photograph objects where they stand, by `by_hand`, for `refgs bench masks`.
 """
 
 import importlib
