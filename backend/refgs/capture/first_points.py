@@ -129,8 +129,8 @@ def _thinned(points: np.ndarray, capture: Capture, count: int, seed: int) -> tup
 def _random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
     """Place `count` points at random: evenly in the user's box. If there is no box, place them in the ball that the cameras look at.
 
-    In two cases, up to half of the points are placed farther out, for what is around the box or the ball: if there is a box, and if the
-    photos show a room or an open scene. The inverse distances of these points from the centre are uniform.
+    In two cases, up to half of the points are placed farther out, for what is around the box or the ball: if there is a box, and if
+    `capture.bounded` is false. The inverse distances of these points from the centre are uniform.
     """
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))
