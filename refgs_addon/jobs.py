@@ -163,6 +163,8 @@ class Job:
                     self._fail(f"the trainer, {event['refgs']}, is {age} than this add-on: install the same release")
             case "started":
                 self.state, self.line = "running", _FIRST.get(event["job"], "")
+            case "stage" | "decided" if event.get("detail"):  # for the run's log.txt alone
+                pass
             case "stage":
                 self.line, self.fraction = event["what"], event.get("part", self.fraction)
             case "warning":

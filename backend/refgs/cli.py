@@ -16,7 +16,7 @@ import refgs
 from refgs.asked import Asked
 from refgs.errors import TRY_AGAIN, InputError, InputWarning, TryAgain, one_line
 from refgs.memory import check_limit, shortage_named
-from refgs.paths import disk_errors_named
+from refgs.paths import command_line, disk_errors_named
 from refgs.process import check_arguments, check_current_folder, open_streams, terminate
 
 STATUSES = (
@@ -111,12 +111,17 @@ def train(
         bool,
         typer.Option("--once", help="start, or resume, or do nothing where it is done: a scheduler can repeat it"),
     ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="print all lines of RUN/log.txt, also those for developers")
+    ] = False,
 ) -> None:
     """Train surfels, materials and light from a capture."""
     asked = Asked(capture, out, preset, device, minutes, tuple(changes or ()), resume, run, hints)
     from refgs import commands
 
-    commands.train(asked, once)
+    commands.train(asked, once, verbose)
+    if not (out / "mesh.glb").exists():
+        print(f"next, make its mesh and textures: {command_line('refgs', 'export', out)}")
 
 
 @app.command()

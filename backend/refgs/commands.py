@@ -14,7 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from refgs import train_job
 from refgs.asked import Asked, check_device
-from refgs.errors import TRY_AGAIN, InputError, one_line
+from refgs.errors import TRY_AGAIN, InputError
+from refgs.events import event_line
 from refgs.export.export_job import export as export_run
 from refgs.lock import remove_stale_lock
 from refgs.paths import clone_root, command_line, disk_errors_named, make_folders
@@ -45,11 +46,6 @@ def progress_bar(what: str, total: int):
         yield lambda done, note="", total=total: progress.update(task, completed=done, note=note, total=total)
 
 
-def print_event(event: str, facts: dict) -> None:
-    """Print an event of a long-running job as one line. The text is facts["what"]; warnings are marked."""
-    console.print(("warning: " if event == "warning" else "") + one_line(facts["what"]))
-
-
 @contextmanager
 def job_report(what: str):
     """Show the events of a long-running job: progress as a bar with the label `what`, other events as lines.
@@ -62,7 +58,7 @@ def job_report(what: str):
             if event == "progress":
                 bar(facts["done"], facts["stage"], facts["total"])
             else:
-                print_event(event, facts)
+                console.print(event_line(event, facts))
 
         yield report
 
@@ -123,7 +119,7 @@ def masks(folder: Path, changes: list[str], model: Path | None = None, once: boo
     console.print(f"the object's box: {' '.join(found['region'])}")
 
 
-def train(asked: Asked, once: bool = False) -> None:
+def train(asked: Asked, once: bool = False, verbose: bool = False) -> None:
     """Train on a capture and write a run folder, or resume the training in it.
 
     Ctrl-C ends the training with a checkpoint, from which it can be resumed. A second Ctrl-C ends it at once. SIGTERM also ends it with a
@@ -131,7 +127,7 @@ def train(asked: Asked, once: bool = False) -> None:
     be resumed from the previous checkpoint.
 
     With `once`, a training that has ended is left as it is; any other is started or resumed. Each call must have the same settings as the
-    first one.
+    first one. With `verbose`, details are printed, too, which are in log.txt otherwise (see `events.Report`).
     """
     if once:
         left = train_job.unfinished(asked)
@@ -150,8 +146,8 @@ def train(asked: Asked, once: bool = False) -> None:
             elif event == "progress":
                 note = f"loss {facts['loss']:.4f}  {facts['psnr']:.2f} dB  {facts['splats']:,} surfels"
                 bar(facts["iteration"], note, facts["total"])
-            elif event != "measured":
-                print_event(event, facts)
+            elif event != "measured" and (verbose or not facts.get("detail")):
+                console.print(event_line(event, facts))
 
         state, quality = train_job.train(asked, report, lambda _: bool(stopped))
     if not state.ended:
@@ -376,7 +372,7 @@ def _batch_bars() -> Iterator[Callable[[str, dict], None]]:
 
         def report(event: str, facts: dict) -> None:
             if event != "progress":
-                print_event(event, facts)
+                console.print(event_line(event, facts))
                 return
             note = f"{facts['failed']} failed" if facts["failed"] else ""
             progress.update(whole, completed=facts["done"], total=facts["total"], note=note)

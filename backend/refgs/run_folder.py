@@ -18,11 +18,12 @@ from refgs.settings import Settings, recorded_settings
 
 PHOTOS = "photos"  # a folder of reduced photos, while they are trained on
 CHECKPOINTS = "checkpoints"
+LOG = "log.txt"  # the lines of all events, and tracebacks
 SPLATS = "splats.ply"  # written last: a run that has it has ended
 # What a training leaves that is killed before its first checkpoint: what it writes before run.toml, and after it.
 _BEFORE = (CHECKPOINTS, "capture.json", "cameras.json", "hints.json")
 _AFTER = ("run.toml", "needs.json", "needs", "history.jsonl", "preview")
-_KEPT = (PHOTOS, "log.txt", LOCK, PROGRESS, STOP)  # does no harm to a new run
+_KEPT = (PHOTOS, LOG, LOCK, PROGRESS, STOP)  # does no harm to a new run
 
 
 def check_free(folder: Path) -> None:

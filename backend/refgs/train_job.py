@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from refgs.asked import Asked
 from refgs.effective import Effective
 from refgs.errors import InputError, TryAgain
-from refgs.events import Report
+from refgs.events import Report, event_line
 from refgs.formats.run_toml import Trained
 from refgs.lock import RunLock, remove_stale_lock
 from refgs.memory import shortage_named, trim
 from refgs.paths import check_folder, command_line, disk_errors_named
 from refgs.run_folder import (
     CHECKPOINTS,
+    LOG,
     PHOTOS,
     SPLATS,
     check_asked,
@@ -55,10 +56,33 @@ class _Known(NamedTuple):
     hints: "Sequence[Hint]" = ()
 
 
+class _Log:
+    """Pass events on to the function `report`, and add their lines to log.txt in the run folder `out`.
+
+    The first lines wait until the run folder is created, so that a training which cannot start leaves no folder.
+    """
+
+    def __init__(self, out: Path, report: Report) -> None:
+        self._out, self._report, self._waiting = out, report, ""
+
+    def __call__(self, event: str, facts: dict[str, Any]) -> None:
+        if "what" in facts:
+            self._waiting += f"{event_line(event, facts)}\n"
+            if (self._out / "run.toml").exists():
+                self.write()
+        self._report(event, facts)
+
+    def write(self, more: str = "") -> None:
+        """Write the waiting lines, and then the text `more`. Ignore write errors: no training ends because its log cannot be written."""
+        with suppress(OSError), open(self._out / LOG, "a", encoding="utf-8") as file:
+            file.write(self._waiting + more)
+        self._waiting = ""
+
+
 def train(asked: Asked, report: Report, attend: "Callable[[State], bool]") -> "tuple[State, float | None]":
     """Train on a capture and write a run folder, or resume the training in it. At the end write the results and measure their quality.
 
-    - `report(event, facts)` is called for progress and warnings.
+    - `report(event, facts)` is called for progress and warnings. The lines of all events are also added to log.txt in the run folder.
     - `attend(state)` is called before each iteration. If it returns True, the training stops with a checkpoint, and can be resumed. Another
       process can stop it too (`refgs.lock`).
     - With hints, most of a finished run's training is repeated. The hinted parts of the surface stay metal or paint (`train/hints.py`).
@@ -66,7 +90,7 @@ def train(asked: Asked, report: Report, attend: "Callable[[State], bool]") -> "t
     Returns the training's state and the mean PSNR of the held-out views. `state.ended` is False if the training was stopped. The PSNR is
     None then, or if there are no held-out views.
     """
-    plan, out, lock = Plan(asked.minutes), asked.out, RunLock(asked.out)
+    plan, out, lock, report = Plan(asked.minutes), asked.out, RunLock(asked.out), _Log(asked.out, report)
     known = _known(asked)
     with ExitStack() as held:
         held.enter_context(_removed_if_empty(out))
@@ -78,9 +102,10 @@ def train(asked: Asked, report: Report, attend: "Callable[[State], bool]") -> "t
             clear(out)
         capture, effective = _read_capture(asked.capture, known, report)
         device = choose_device(asked.device, report)
-        held.enter_context(_logged(out))
+        held.enter_context(_logged(report))
         with _card_memory():
             trainer = _trainer(asked, known, capture, effective, plan, device, report)
+        report.write()
         held.enter_context(disk_errors_named([out], "resume with --resume"))
         state = trainer.state
         trainer.run(lambda: attend(state) or lock.attend(state.iteration, state.total, state.seconds))
@@ -322,7 +347,7 @@ def _finish(trainer: "Trainer") -> float | None:
         update_metrics(out, _most_memory() | {"ambiguities": trades, "total_seconds": state.plan.spent})
         for facts in trades.values():
             if "what" in facts:
-                state.report("stage", {"what": facts["what"]})
+                state.report("stage", {"what": facts["what"], "detail": True})
         if (out / PHOTOS).exists():
             trainer.release_photos()
             _remove_photos(out)
@@ -375,15 +400,14 @@ def _card_memory(what: str | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def _logged(out: Path) -> Iterator[None]:
-    """Write the traceback of a `with` block's unexpected error (no InputError) to log.txt."""
+def _logged(log: _Log) -> Iterator[None]:
+    """Write the traceback of a `with` block's unexpected error (no InputError) to the log."""
     try:
         yield
     except InputError:
         raise
     except Exception:
-        with suppress(OSError):
-            (out / "log.txt").write_text(traceback.format_exc(), encoding="utf-8")
+        log.write(traceback.format_exc())
         raise
 
 

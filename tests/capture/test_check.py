@@ -10,7 +10,7 @@ import pytest
 from refgs.capture import read_capture
 from refgs.capture.check import check, describe
 from refgs.errors import InputError
-from tests.makers.captures import CENTRE, ball, colmap, edit, nerf_blender, nerfstudio, ring, write
+from tests.makers.captures import CENTRE, ball, colmap, edit, look_at, nerf_blender, nerfstudio, ring, write
 
 
 def text(folder) -> str:
@@ -26,7 +26,7 @@ def test_an_object_with_masks(tmp_path):
         "56.1° wide, no distortion",
         "28 views (the photos' alpha), covering 11 %",
         "12 to 52° above it, 345° around it",
-        "an object: the photos have masks",
+        "Taken for an object: the photos have masks. So what is outside the masks is not reconstructed",
     ):
         assert part in said, said
     assert "Warning" not in said
@@ -95,6 +95,97 @@ def test_cameras_in_a_room_are_not_taken_for_opencvs(tmp_path):
         pose[:3, 3] += rng.uniform(-0.7, 0.7, 3)
     said = text(nerfstudio(tmp_path, poses=poses))
     assert "the cameras look outwards" in said and "OpenCV" not in said and "see the centre" not in said
+
+
+def arc(degrees: float, astray: float = 0.0) -> list[np.ndarray]:
+    """Return cameras on a part of a ring about an object. They look past it by about `astray` times their distance."""
+    rng, poses = np.random.default_rng(0), []
+    for k in range(24):
+        azimuth, elevation = np.radians(degrees) * (k / 23 - 0.5), (0.3, 0.8)[k % 2]
+        away = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+        poses.append(look_at(4 * np.array(away), 4 * astray * rng.normal(size=3)))
+    return poses
+
+
+def room(kind: str) -> list[np.ndarray]:
+    """Return cameras in a room: from its middle outwards, on a walk through it, along a wall, or across it from one half or all around."""
+    rng, poses = np.random.default_rng(0), []
+    for k in range(40):
+        part = k / 39
+        across = rng.uniform((-2, -2, 0), (2, 2, 2))
+        turn = 2 * np.pi * part * (3 if kind == "walk" else 1)
+        ahead = np.array([np.cos(turn), np.sin(turn), 0.0])
+        at = {
+            "outwards": 0.5 * ahead + rng.normal(size=3) * 0.2,
+            "walk": np.array([4 * part, 0.3 * np.sin(9 * part), 1.5]),
+            "along": np.array([0.0, 6 * part, 1.5]) + 0.05 * rng.normal(size=3),
+            "from one half": np.array([rng.uniform(0, 1.5), rng.uniform(0, 6), 1.6]),
+            "from all around": 3 * ahead + (0, 0, 1.6),
+        }[kind]
+        to = {
+            "along": at + np.array([1, 0.1 * rng.normal(), 0.1 * rng.normal()]),
+            "from one half": np.array([6, rng.uniform(0, 6), rng.uniform(0.3, 2.3)]),
+            "from all around": across,
+        }.get(kind, at + ahead)
+        poses.append(look_at(at, to))
+    return poses
+
+
+AROUND, ASIDE = "surround one place they look at", "look at one place, from one side of it"
+
+
+@pytest.mark.parametrize(
+    ("poses", "why"),
+    [
+        (arc(345), AROUND),
+        (arc(270), AROUND),
+        (arc(180), ASIDE),
+        (arc(180, 0.06), ASIDE),
+        (arc(120), ASIDE),
+        (arc(120, 0.08), ASIDE),
+        (arc(60), ASIDE),
+    ],
+)
+def test_cameras_that_look_at_one_place_show_an_object(tmp_path, poses, why):
+    said = text(nerfstudio(tmp_path, poses=poses)).splitlines()
+    (line,) = [line for line in said if line.startswith("Taken for")]
+    assert line == (
+        f"Taken for an object: the cameras {why} (no masks: a guess). So refgs train makes masks of it first, and leaves out its "
+        "surroundings; it keeps them with --set image.masks=off"
+    )
+    assert any(line.startswith("Object: not masked") for line in said)
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        ("outwards", "the cameras look outwards"),
+        ("walk", "the cameras look outwards"),
+        ("along", ""),  # axes are parallel: either may be said
+        ("from one half", "there are no masks and the cameras do not look at one place"),
+        ("from all around", "there are no masks and the cameras do not look at one place"),
+    ],
+)
+def test_cameras_in_a_room_show_no_object(tmp_path, kind, why):
+    said = text(nerfstudio(tmp_path, poses=room(kind))).splitlines()
+    (line,) = [line for line in said if line.startswith("Taken for")]
+    assert line.startswith(f"Taken for a room or open scene: {why}")
+    outwards = "cameras look outwards" in line
+    assert ("So no masks are made, and all that the photos show is reconstructed" in line) == outwards
+    assert ("So refgs train looks for an object all the same, to mask it" in line) != outwards
+    assert any(line.startswith("Object: not masked") for line in said) != outwards
+
+
+def test_what_follows_where_no_masks_are_made_or_some_are_missing(tmp_path):
+    opaque = nerf_blender(tmp_path / "opaque", {"train": 24, "test": 4})
+    for photo in opaque.glob("*/*.png"):
+        write(photo, cv2.imread(str(photo))[..., ::-1])
+    said = text(opaque)
+    assert "one place they look at (no masks: a guess). So no masks are made, and all that the photos show is" in said
+    some = nerfstudio(tmp_path / "some", count=24)
+    for i, pose in enumerate(ring(24)[:20]):
+        write(some / "masks" / f"{i:04d}.png", ball(pose, 64, 48, 60.0)[..., 3])
+    assert "have masks. So what is around it in photos without a mask is reconstructed, too" in text(some)
 
 
 def test_masks_that_look_inverted(tmp_path):

@@ -263,7 +263,7 @@ def test_scaled_poses_and_rounding_are_made_rigid(tmp_path):
     assert_sees_the_ball(read_capture(folder))
 
 
-def test_one_sided_cameras_are_not_taken_for_an_object(tmp_path):
+def test_one_sided_cameras_do_not_surround_an_object(tmp_path):
     poses = [pose for pose in ring(48) if pose[0, 3] > CENTRE[0] + 1.2]
     capture = read_capture(nerfstudio(tmp_path, poses=poses))
     assert not capture.bounded and "one side" in capture.bounded_because

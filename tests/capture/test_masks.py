@@ -14,6 +14,7 @@ from refgs.camera import Camera
 from refgs.capture import masks as making
 from refgs.capture import read_capture, silhouettes, to_run_frame
 from refgs.capture.backdrop import HIDDEN, Backdrop, Plane, find_plane
+from refgs.capture.check import describe
 from refgs.capture.images import read_image
 from refgs.capture.masks import make_masks, region_settings
 from refgs.errors import InputError
@@ -349,11 +350,21 @@ def test_covered_floor_counts_for_the_object_only_where_photos_disagree():
 
 
 def test_made_masks_are_noted(tmp_path):
-    photograph(tmp_path)
+    truths = photograph(tmp_path)
     make_masks(tmp_path, None, silent)
     files = (tmp_path / "masks").glob("*.png")
     noted = json.loads((tmp_path / "masks" / "made.json").read_text())
     assert {hashlib.sha256(file.read_bytes()).hexdigest() for file in files} == set(noted)
+
+    def said() -> str:
+        (line,) = [line for line in describe(read_capture(tmp_path)) if line.startswith("Masks")]
+        return line.partition(", covering")[0]
+
+    assert said() == f"Masks: {COUNT} views (made by RefGS)"
+    write(tmp_path / "masks" / "0003.png", np.where(truths[3], 255, 0).astype(np.uint8))
+    assert said() == f"Masks: {COUNT} views (made by RefGS: {COUNT - 1}, mask files: 1)"
+    (tmp_path / "masks" / "made.json").unlink()
+    assert said() == f"Masks: {COUNT} views (mask files)"
 
 
 def test_a_ring_is_seen_through_and_highlights_are_not(tmp_path):

@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from refgs.capture.box import Box
 from refgs.capture.cameras import write_cameras
 from refgs.capture.images import LoadedView, load_view
 from refgs.capture.not_used import not_used
 from refgs.capture.priors import FOLDERS, load_depth, load_normals
-from refgs.capture.region import LOOK_OUT
+from refgs.capture.region import LOOK_OUT, ONE_SIDED
 from refgs.capture.types import Z_UP, Capture, View
 from refgs.errors import InputError, one_line
 from refgs.paths import whole
@@ -61,6 +62,7 @@ def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
     of up to 12 photos are written to it.
     """
     statistics = _decode_all(capture, thumbnails)
+    guess = _guessed_box(capture)
     return [
         f"Layout: {LAYOUTS[capture.layout]}",
         f"Views: {len(capture.views)}, {len(capture.train_views)} to train on, {len(capture.test_views)} to test on",
@@ -68,10 +70,10 @@ def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
         _lenses(capture),
         _masks(capture, statistics),
         *_priors(capture),
-        *_guessed_object(capture),
+        *_guessed_object(guess),
         _poses(capture),
         _extent(capture),
-        f"Taken for {'an object' if capture.bounded else 'a room or open scene'}: {capture.bounded_because}",
+        _taken_for(capture, guess),
         *(f"Not used: {one_line(what)}" for what in not_used(capture)),
         *(f"Warning: {one_line(warning)}" for warning in [*capture.warnings, *_warnings(capture, statistics)]),
     ]
@@ -169,10 +171,14 @@ def _masks(capture: Capture, statistics: list[_Statistics]) -> str:
     coverage = [s.coverage for s in statistics if s.coverage is not None]
     if not coverage:
         return "Masks: none"
-    alpha = sum(view.has_alpha for view in capture.views)
-    kind = "the photos' alpha" if alpha == len(coverage) else "mask files" if alpha == 0 else "mask files and alpha"
+    from refgs.capture.masks import count_made  # imports scipy, which a wrong folder should not wait for
+
+    made, files = count_made(capture), sum(view.mask_path is not None for view in capture.views)
+    counts = {"made by RefGS": made, "mask files": files - made, "the photos' alpha": len(coverage) - files}
+    found = {kind: count for kind, count in counts.items() if count}
+    kinds = ", ".join(f"{kind}: {count}" if len(found) > 1 else kind for kind, count in found.items())
     return (
-        f"Masks: {len(coverage)} views ({kind}), covering {_span([100 * c for c in coverage], '.0f')} % of the picture"
+        f"Masks: {len(coverage)} views ({kinds}), covering {_span([100 * c for c in coverage], '.0f')} % of the picture"
     )
 
 
@@ -185,21 +191,43 @@ def _priors(capture: Capture) -> list[str]:
     return lines
 
 
-def _guessed_object(capture: Capture) -> list[str]:
-    """Return a line naming the guessed box of the object, [] if there is none."""
-    if any(view.masked for view in capture.views) or capture.layout in Z_UP or capture.box is not None:
-        return []
-    from refgs.capture.masks import (  # imports scipy, which a wrong folder should not wait for
-        guess_box,
-        region_settings,
-    )
+def _guessed_box(capture: Capture) -> Box | None:
+    """Return the guessed box in which a training would look for the object, or None."""
+    # It makes no masks if a photo has one, if the layout has no place for them, or if the cameras look outwards.
+    if any(view.masked for view in capture.views) or capture.box is not None:
+        return None
+    from refgs.capture.masks import guess_box, masks_folder  # imports scipy, as above
 
     try:
-        box = guess_box(capture, capture.views)[0]
-    except InputError:  # the cameras look outwards
+        masks_folder(capture)
+        return guess_box(capture, capture.views)[0]
+    except InputError:
+        return None
+
+
+def _guessed_object(guess: Box | None) -> list[str]:
+    if guess is None:
         return []
-    where = " ".join(region_settings(box))
+    from refgs.capture.masks import region_settings
+
+    where = " ".join(region_settings(guess))
     return [f"Object: not masked. refgs train and refgs masks look for it in the box {where}, a guess"]
+
+
+def _taken_for(capture: Capture, guess: Box | None) -> str:
+    """Return a line that says what the capture is taken for, why, and what follows for a training. `guess` is from `_guessed_box`."""
+    is_object = capture.bounded or capture.bounded_because == ONE_SIDED
+    if capture.masked:
+        follows = "what is outside the masks is not reconstructed"
+    elif any(view.masked for view in capture.views):
+        follows = "what is around it in photos without a mask is reconstructed, too"
+    elif guess is None:
+        follows = "no masks are made, and all that the photos show is reconstructed"
+    else:
+        still = "makes masks of it first" if is_object else "looks for an object all the same, to mask it"
+        follows = f"refgs train {still}, and leaves out its surroundings; it keeps them with --set image.masks=off"
+    kind = "an object" if is_object else "a room or open scene"
+    return f"Taken for {kind}: {capture.bounded_because}. So {follows}"
 
 
 def _poses(capture: Capture) -> str:

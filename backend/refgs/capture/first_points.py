@@ -124,7 +124,7 @@ def _thinned(points: np.ndarray, capture: Capture, count: int, seed: int) -> tup
 
 def _random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
     """Place random points in the box or ball, with some around it where needed."""
-    # In a room or an open scene, and around a box, up to half of the points are farther out: their inverse distances are uniform.
+    # Around a box, and where `capture.bounded` is false, up to half of the points are farther out: their inverse distances are uniform.
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)

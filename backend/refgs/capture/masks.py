@@ -93,7 +93,7 @@ def with_masks(
     made = _hashes(root)
     if WHITE_MASKS in capture.warnings:
         _check_white(files, made)
-    views = [replace(v, mask_path=None) if v.mask_path and _hash(v.mask_path) in made else v for v in capture.views]
+    views = [replace(view, mask_path=None) if _is_made(view, made) else view for view in capture.views]
     if all(view.masked for view in views):
         raise InputError(f"{folder}: every photo has a mask that was not made here. Remove those that you want made.")
     targets = _targets(root, views)
@@ -210,6 +210,19 @@ def moved_region(wanted: RegionSettings, moved: list[list[float]]) -> RegionSett
 def masks_folder(capture: Capture) -> Path:
     """Return the folder for a capture's masks. Raises InputError if the capture's layout stores masks in its photos or depth maps."""
     return _root(capture) / "masks"
+
+
+def count_made(capture: Capture) -> int:
+    """Count the views whose masks were made here, and not changed since. The hashes in masks/made.json tell."""
+    try:
+        made = _hashes(_root(capture))
+    except InputError:  # the layout has no folder of masks
+        return 0
+    return sum(_is_made(view, made) for view in capture.views) if made else 0
+
+
+def _is_made(view: View, made: set[str]) -> bool:
+    return view.mask_path is not None and _hash(view.mask_path) in made
 
 
 def _check_writable(root: Path) -> None:

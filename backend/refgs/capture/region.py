@@ -14,6 +14,7 @@ from refgs.errors import InputError
 from refgs.geometry.project import inside, project
 
 LOOK_OUT = "the cameras look outwards"
+ONE_SIDED = "the cameras look at one place, from one side of it (no masks: a guess)"
 NEAR = 100.0  # largest distance from the origin in radii; largest radius, and inverse of the smallest
 
 WHITE_MASKS = "the masks are white (opaque) everywhere, so they are not used: make them anew, the object white on black"
@@ -23,7 +24,8 @@ WHITE_MASKS = "the masks are white (opaque) everywhere, so they are not used: ma
 class Region:
     """Region of interest: a ball, in the coordinates of the cameras.
 
-    `bounded` is True if the photos show one object, False if they show a room or an open scene. `because` gives the reason in words.
+    `bounded` is True if the photos have masks of one object, or surround one. It is False if they show a room or an open scene, or an
+    object from one side (ONE_SIDED), with what is behind it. `because` gives the reason in words.
     """
 
     centre: np.ndarray
@@ -63,7 +65,7 @@ def find_region(
     if miss > 0.25:
         return Region(centre, radius, False, "there are no masks and the cameras do not look at one place")
     if _one_sided(views, centre, up) > 0.6:
-        return Region(centre, radius, False, "there are no masks and the cameras stand on one side")
+        return Region(centre, radius, False, ONE_SIDED)
     return Region(centre, radius, True, "the cameras surround one place they look at (no masks: a guess)")
 
 

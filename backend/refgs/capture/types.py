@@ -71,7 +71,7 @@ class Capture:
     - `points` (M, 3) are from structure from motion, `point_colors` (M, 3) their sRGB colours in 0..1. Both are None if the capture has
       none.
     - `centre` (3,) and `radius` are the region of interest: a ball about the object, or about a room's foreground.
-    - `bounded` is a guess: True if the photos surround one object, False if they show a room or an open scene. `bounded_because` says why.
+    - `bounded` and `bounded_because` are the guess of `Region`: whether the photos are of one object, and why.
     - `box` is the user's box around the part to reconstruct, or None. It makes the region of interest smaller.
     - `reach` is the radius of a ball about `centre` that contains the whole region of interest found without the box. It equals `radius` if
       there is no box.

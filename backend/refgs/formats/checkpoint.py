@@ -20,6 +20,7 @@ class Facts(Model):
     - `initial`: true while the initial stage lasts, in which each surfel is shaded before blending
     - `residual`: true once the surfels learn a residual, a colour that material and light do not explain
     - `decided`: the last line that told the user about a decision, by the decision's topic
+    - `details`: the topics in `decided` whose line is a detail, which only log.txt has
     - `clock`: the time spent on each kind of work, such as shading, by its name
     - `needs`: the decisions about optional parts of the training, such as inter-reflection, by the part's name
     - `parts`: the numbers and flags that each `refgs.train.part.Part` remembers, by its name. A `Part` is the memory of one task of the
@@ -34,6 +35,7 @@ class Facts(Model):
     spent: Seconds
     processor_seconds: Seconds
     decided: dict[str, str]
+    details: tuple[str, ...] = ()  # earlier releases told none from the others
     clock: dict[str, Finite]
     needs: dict[str, Found]
     parts: dict[str, dict[str, bool | Count]]

@@ -32,7 +32,7 @@ class Trained(Maker):
     - `fingerprint`: a hash of the capture, which tells whether it has changed since
     - `preset`: the name of the settings' preset
     - `centre`, `radius`: the region of interest, a ball, in the run's coordinates
-    - `bounded`: true if the photos surround one object, false if they show a room or an open scene
+    - `bounded`: true if the photos have masks of one object or surround it, false if they show a room, an open scene or one side
     """
 
     capture: str

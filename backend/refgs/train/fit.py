@@ -78,7 +78,7 @@ def fitting(
     settings = trainer.state.settings
     found = f"{settings.train.iterations:,} iterations, {settings.surfels.budget:,} surfels at most"
     what = f"planned for {plan.minutes:g} minutes: about {found}, photos of {settings.image.max_side} pixels at most"
-    report("stage", {"what": what})
+    report("stage", {"what": what, "detail": True})
     return trainer
 
 

@@ -49,7 +49,7 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     if state.from_hull and state.method.lit and state.settings.light.frame == "world":
         with state.clock.part("start"):
             start, on_hull, source = start_parameters(capture, state.views, state.settings, hollows=True)
-    report("stage", {"what": source})
+    report("stage", {"what": source, "detail": True})
     _start_learning(state, start)
     state.parts = {kind: kind() for kind in PARTS}
     for part in state.parts.values():
@@ -76,7 +76,7 @@ def _choose_light_frame(state: State, start: Parameters, on_hull: int) -> None:
     state.change("light.frame", frame, "photos", why)
     if lit:
         where = "turns with the camera" if frame == "camera" else "stands still"
-        state.announce("light", f"the light {where}: {why}")
+        state.announce("light", f"the light {where}: {why}", detail=frame == "world")
 
 
 def _start_learning(state: State, start: Parameters) -> None:
@@ -128,4 +128,4 @@ def start_deferred(state: State, step: Step) -> None:
     state.learned.fill("environment", light.start_value(state))
     if "exposure" in state.learned:  # exposures were learned with the earlier light
         state.learned.fill("exposure", 0.0)
-    state.report("stage", {"what": "shading what is blended: colour, material and light start anew"})
+    state.report("stage", {"what": "pixels are shaded now: colour, material and light start anew", "detail": True})

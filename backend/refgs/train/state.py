@@ -71,6 +71,7 @@ class State:
         self.iteration, self.total = 0, self.settings.train.iterations
         self.seconds = 0.0
         self.decided: dict[str, str] = {}  # lines for the artist, by what was decided
+        self.details: set[str] = set()  # those of these decisions whose line is a detail
         self.needs: dict[str, Found] = {}  # the decisions of `train/decide`, by the need's name
         self.initial = self.method.deferred and self.settings.initial.until > 0  # the initial stage is not over yet
         self.residual = False  # the residual learns (see `residual_start`)
@@ -179,11 +180,16 @@ class State:
             return torch.ones(len(position), dtype=torch.bool, device=self.device)
         return torch.from_numpy(box.contains(position.numpy(force=True))).to(self.device)
 
-    def announce(self, about: str, what: str) -> None:
-        """Report the decision `about` to the user, unless the same `what` was reported before."""
+    def announce(self, about: str, what: str, detail: bool = False) -> None:
+        """Report the decision `about` to the user, unless the same `what` was reported before.
+
+        A `detail` is only logged (see `events.Report`), unless it replaces a line that was shown.
+        """
         if self.decided.get(about) != what:
+            detail = detail and (about in self.details or about not in self.decided)
+            self.details = self.details | {about} if detail else self.details - {about}
             self.decided[about] = what
-            self.report("decided", {"about": about, "what": what})
+            self.report("decided", {"about": about, "what": what, "detail": detail})
 
     def change(self, key: str, value: Any, by: By, why: str) -> None:
         """Change the setting `key` ("section.name") from now on, recording its cause `by` and `why`."""

@@ -19,7 +19,7 @@ VISIBLE = 0.1  # dB over a small part of the object (`probe.PART`): in the mean,
 class Reflections(Need):
     """Decide whether the scene needs inter-reflection: whether the object visibly mirrors itself."""
 
-    name, what = "reflections", "inter-reflection"
+    name, what, shown = "reflections", "inter-reflection", True
     threshold = 0.1  # dB
     reason = "it is between mirroring black and mirroring the light: more than the object's own light can be worth"
     moments = ("start", "mesh")

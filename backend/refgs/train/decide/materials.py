@@ -24,7 +24,7 @@ INDIRECT = "indirect_dc", "indirect_rest", "received"
 class Specular(Need):
     """Decide whether the scene needs specular shading, with metallic, roughness and inter-reflection."""
 
-    name, what = "specular", "specular shading"
+    name, what, shown = "specular", "specular shading", True
     threshold = 0.3  # dB
     reason = (
         "at a twentieth of a training matte clay has none; a polished plate has 0.8 dB, glossy paint 2.6, a mirror 5.6"

@@ -60,6 +60,7 @@ class Need:
 
     name: ClassVar[str]  # also the key in the settings' `needs`
     what: ClassVar[str]  # words that the artist reads
+    shown: ClassVar[bool] = False  # tell the artist if it is left out; other decisions are details
     threshold: ClassVar[float] = math.nan
     reason: ClassVar[str] = ""  # why the threshold is what it is
     moments: ClassVar[tuple[Moment, ...]]

@@ -78,7 +78,7 @@ def reflections(state: State, step: Step) -> None:
     """Decide whether inter-reflection is needed, or report how much the object mirrors itself."""
     hidden = step.hidden or 0.0
     if not evaluate(state, "mesh", Given(step.done, hidden)):
-        state.announce("reflections", f"with {Reflections.what}: {share_hidden(hidden)}")
+        state.announce("reflections", f"with {Reflections.what}: {share_hidden(hidden)}", detail=True)
 
 
 def _record(state: State, need: Need, decision: Decision) -> None:
@@ -93,7 +93,8 @@ def _record(state: State, need: Need, decision: Decision) -> None:
     state.needs[need.name] = found
     if found.pictures:
         write_text(state.folder / "needs.json", json.dumps(rows(state), indent=1))
-    state.announce(need.name, f"{'with' if decision.needed else 'without'} {need.what}: {decision.why}")
+    what = f"{'with' if decision.needed else 'without'} {need.what}: {decision.why}"
+    state.announce(need.name, what, detail=decision.needed or not need.shown)
     if not decision.needed:
         decision.once()
         need.apply(state, found)

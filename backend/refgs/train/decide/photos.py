@@ -18,7 +18,7 @@ ALIKE_PIXELS, ALIKE_DECIBELS = 0.5, 40.0  # duplicates move by less, and differ 
 class Views(Need):
     """Decide whether the training needs all of its views. Views that duplicate others are removed."""
 
-    name, what = "views", "all photos"
+    name, what, shown = "views", "duplicate photos", True
     threshold, reason = 1, "each duplicate costs as much as a photo that adds something"
     moments = ("photos",)
 

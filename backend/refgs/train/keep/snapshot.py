@@ -27,7 +27,7 @@ def save(state: State) -> None:
     facts = {"seconds": state.seconds, "total": state.total, "initial": state.initial, "residual": state.residual}
     facts |= {"clock": state.clock.seconds, "spent": state.plan.spent, "processor_seconds": state.clock.processor}
     found = {name: found.model_dump(exclude_none=True) for name, found in state.needs.items()}
-    facts |= {"decided": state.decided, "needs": found, "parts": parts}
+    facts |= {"decided": state.decided, "details": sorted(state.details), "needs": found, "parts": parts}
     checkpoint.save(state.folder / "checkpoints", state.iteration, tensors, facts)
 
 
@@ -49,7 +49,7 @@ def restore(state: State, run: Path) -> None:
     state.initial = state.initial if facts.initial is None else facts.initial
     state.residual = facts.residual
     for about, what in facts.decided.items():
-        state.announce(about, what)
+        state.announce(about, what, about in facts.details)
     try:
         state.learned.load(tensors)
         for part in state.parts.values():

@@ -56,7 +56,7 @@ def begin(state: State, pixels: float, refined: bool) -> None:
     if len(found) > 1:
         factor = found[0].factor
         what = f"photos are reduced by a factor of {factor} at first: the object spans {pixels:.0f} pixels"
-        state.report("stage", {"what": what})
+        state.report("stage", {"what": what, "detail": True})
         set_factor(state, factor)
 
 
@@ -67,7 +67,7 @@ def refine(state: State, step: Step) -> None:
     if factor < coarse.factor:
         set_factor(state, factor)
         size = "in full size" if factor == 1 else f"reduced by a factor of {factor}"
-        state.report("stage", {"what": f"photos are {size} from now on"})
+        state.report("stage", {"what": f"photos are {size} from now on", "detail": True})
 
 
 def set_factor(state: State, factor: int) -> None:

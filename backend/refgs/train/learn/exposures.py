@@ -59,7 +59,7 @@ def leave_out_alike(state: State, step: Step) -> None:
         return
     if differs < ALIKE:
         state.learned.drop("exposure")
-        state.announce("exposures", "the photos have no exposures of their own: they agree within a third of a stop")
+        state.announce("exposures", "the photos have no exposures of their own: all within 1/3 of a stop", detail=True)
     elif state.learned["exposure"].shape[1] > 1:
         state.learned.columns("exposure", 1)
-        state.announce("exposures", "the photos differ in exposure, but not in white balance")
+        state.announce("exposures", "the photos differ in exposure, but not in white balance", detail=True)

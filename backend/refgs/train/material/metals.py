@@ -88,7 +88,7 @@ def find_metals(state: State, step: Step) -> None:
     state.learned.forget("metallic", metal | refuted)
     state.part(Metals).found = True
     part = float(weight[metal].sum()) / max(whole, 1e-6)
-    state.announce("metals", f"{part:.0%} of the surface shines as metals do")
+    state.announce("metals", f"{part:.0%} of the surface shines as metals do", detail=part < TOLD)
 
 
 @torch.no_grad()
@@ -118,7 +118,7 @@ def judge(state: State, step: Step) -> None:
     parts = [float(seen.pixels[which.cpu()].sum()) / whole for which in (raised, lowered)]
     if max(parts) > TOLD:
         words = f"{parts[0]:.1%} of the surface is of a piece with metals, {parts[1]:.1%} does not mirror as metals do"
-        state.announce("mirrored", words)
+        state.announce("mirrored", words, detail=True)
 
 
 @torch.no_grad()
