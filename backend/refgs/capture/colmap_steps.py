@@ -23,6 +23,9 @@ ALL_PAIRS = 150  # photos; up to this many, every pair is matched
 NEXT = 5  # photos by name that each one is matched with where there are more
 CAMERA_MODEL = "RADIAL"  # with few photos a second focal length and tangential distortion only fit noise
 SEED = 1
+ONE_THREAD = (
+    1  # of cameras' computation: the sums of several differ from run to run, and with them which photos are placed
+)
 TIED = 3  # points that a photo must share with others; COLMAP asks for 30 where it places one photo after the other
 MATCH_TOLERANCE = 8.0  # pixels from its epipolar line, above which a match contradicts the cameras; COLMAP allows 4
 FEW_CAMERA_MODEL = "SIMPLE_RADIAL"  # of what tells little about the lens: see the next two
@@ -101,6 +104,8 @@ def extract_features(photos: list[Path], masks: list[Path], database: Path, prog
                     cameras[_lens(camera)] = known.write_camera(camera)
             shared.setdefault((cameras[_lens(camera)], folder), []).append(name)
         for (reading.existing_camera_id, folder), names in shared.items():
+            # Number the images in the order of the photos. Threads number them as they finish, which leads to other cameras each time.
+            pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, names, reading)
             pycolmap.extract_features(
                 database, folder, names, pycolmap.CameraMode.SINGLE, reading, extraction
             )  # skips photos that have features already
@@ -173,7 +178,7 @@ def map_one_by_one(photos: list[Path], database: Path, progress: Callable) -> li
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = SEED
+    options.random_seed, options.num_threads = SEED, ONE_THREAD
     options.min_model_size = 3
     options.extract_colors = False
     placed = 0
@@ -204,7 +209,7 @@ def map_at_once(photos: list[Path], database: Path) -> list[Any]:
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
-    options.random_seed = SEED
+    options.random_seed, options.num_threads = SEED, ONE_THREAD
     written = database.with_name(database.name + ".models")
     models = pycolmap.global_mapping(database, photos[0].parent, written, options)
     for model in models.values():
