@@ -1,6 +1,8 @@
 """Measure how well cameras are found from photos alone: `refgs bench cameras --captures DIR`.
 
 DIR has captures with cameras. Each is copied without them, `refgs poses` finds them anew, and they are compared with the given ones.
+`--every 3 --side 400` makes the search harder: every third photo, reduced to 400 pixels. Learned features are a second try where they are
+installed; `--sift` does without.
 """
 
 import argparse
@@ -11,10 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from benchmarks.harness import find_captures
-from refgs.capture import read_capture
-from refgs.capture.motion import find_cameras
+from refgs.capture import motion, read_capture
 from refgs.errors import InputError
 
 
@@ -39,23 +41,53 @@ def rotations(capture: Path) -> dict[str, np.ndarray]:
     return {view.image_path.name: view.camera.world_to_camera[:3, :3] for view in read_capture(capture).views}
 
 
+def copy_photos(folder: Path, copy: Path, every: int, side: int | None) -> None:
+    """Copy every `every`th photo of a capture with its mask to the folder `copy`, reduced to `side` pixels on the longer side."""
+    for view in sorted(read_capture(folder).views, key=lambda view: view.image_path.name)[::every]:
+        for file in filter(None, (view.image_path, view.mask_path)):
+            out = copy / file.relative_to(folder)
+            out.parent.mkdir(parents=True, exist_ok=True)
+            if side is None:
+                shutil.copy(file, out)
+                continue
+            with Image.open(file) as picture:
+                exif = picture.getexif()
+                picture.thumbnail((side, side), Image.Resampling.LANCZOS)
+                picture.save(out, quality=95, exif=exif)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Find the cameras of all captures in a folder anew. Print how many were placed, their errors and the time, a row per capture."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--captures", type=Path, required=True, help="folder with captures that have cameras")
+    parser.add_argument("--every", type=int, default=1, help="use every Nth photo")
+    parser.add_argument("--side", type=int, help="reduce photos to so many pixels on the longer side")
+    parser.add_argument("--sift", action="store_true", help="do without learned features")
     options = parser.parse_args(arguments)
-    row = "{:<12} {:>6} {:>6} {:>7} {:>8} {:>9} {:>9} {:>10} {:>5}".format
-    print(row("capture", "photos", "placed", "mean °", "median °", "largest °", "within 1°", "masks only", "s"))
+    if options.sift:
+        motion.PLACED = 0
+    row = "{:<12} {:>6} {:>6} {:>7} {:>8} {:>9} {:>9} {:>10} {:>8} {:>5}".format
+    head = (
+        "capture",
+        "photos",
+        "placed",
+        "mean °",
+        "median °",
+        "largest °",
+        "within 1°",
+        "masks only",
+        "features",
+        "s",
+    )
+    print(row(*head))
     for folder in find_captures(options.captures):
         given = rotations(folder)
         with tempfile.TemporaryDirectory() as scratch:
             copy = Path(scratch) / folder.name
-            for part in ("images", "masks"):
-                if (folder / part).is_dir():
-                    shutil.copytree(folder / part, copy / part)
+            copy_photos(folder, copy, options.every, options.side)
             start = time.perf_counter()
             try:
-                result = find_cameras(copy, lambda *_: None)
+                result = motion.find_cameras(copy, lambda *_: None)
             except InputError as error:
                 print(f"{folder.name}: {error}")
                 continue
@@ -65,8 +97,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         errors = rotation_errors(np.array([found[n] for n in names]), np.array([given[n] for n in names]))
         figures = (f"{value:.2f}" for value in (errors.mean(), np.median(errors), errors.max()))
         masks_only = "yes" if result["inside"] else "no"
-        within = (errors < 1).sum()
-        print(
-            row(folder.name, result["photos"], result["placed"], *figures, within, masks_only, f"{seconds:.0f}"),
-            flush=True,
-        )
+        within, features = (errors < 1).sum(), "learned" if result["learned"] else "SIFT"
+        counts = result["photos"], result["placed"]
+        print(row(folder.name, *counts, *figures, within, masks_only, features, f"{seconds:.0f}"), flush=True)

@@ -95,6 +95,8 @@ def poses(folder: Path, once: bool = False) -> None:
     console.print(
         f"{found['placed']} of {found['photos']} photos placed, to {found['error']:.2f} pixels: {folder / 'sparse' / '0'}"
     )
+    if found["learned"]:
+        console.print("Learned features were used, because SIFT placed fewer photos or placed them less exactly.")
     if found["inside"]:
         console.print("The object turned in front of still surroundings: only the pixels inside the masks were used.")
 

@@ -13,6 +13,7 @@ from PIL import Image
 
 from refgs.capture import load_view, read_capture
 from refgs.capture.colmap_steps import MATCH_TOLERANCE, _write_mask, epipolar_distance
+from refgs.capture.contact_sheet import GAP, SIDE, TEXT
 from refgs.capture.images import read_header, read_image
 from refgs.capture.motion import UNEXPLAINED, find_cameras
 from refgs.capture.poses import OPENGL_TO_OPENCV
@@ -179,6 +180,43 @@ def test_photos_of_two_sessions(tmp_path, pictures):
     with pytest.raises(InputError, match=match):
         find_cameras(tmp_path, quiet)
     assert {path.name for path in tmp_path.iterdir()} == photos
+
+
+def test_photos_that_hang_together_are_named_and_shown(tmp_path, pictures):
+    """Check that a failed search tells which photos share features, and shows them on a sheet that the next search removes."""
+    random = np.random.default_rng(0)
+    for number in range(8):
+        write(tmp_path / f"noise {number}.png", random.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8))
+        if number < 6:
+            write(tmp_path / f"a {number}.png", pictures[number])
+        if 2 <= number < 5:
+            write(tmp_path / f"b {number}.png", speckled(POSES[number], seed=1)[0])
+    photos = {path.name for path in tmp_path.iterdir()}
+    sheet = tmp_path / "unplaced" / "groups.png"
+    match = (
+        r"only 6 of 17 photos could be placed\. These hang together: 6 \(a 0\.png to a 5\.png\), 3 \(b 2\.png to b 4\.png\), "
+        r"8 with none \(noise 0\.png to noise 7\.png\); see .*groups\.png\. Take more"
+    )
+    with pytest.raises(InputError, match=match) as error:
+        find_cameras(tmp_path, quiet)
+    assert str(sheet) in str(error.value) and "\n" not in str(error.value)
+    assert {path.name for path in tmp_path.iterdir()} == photos | {"unplaced"}
+    rows = read_image(sheet)[0]
+    across, down = SIDE + GAP, SIDE + 2 * TEXT + 3 * GAP
+    assert rows.shape == (GAP + 3 * down, GAP + 8 * across, 3)
+    shown = rows[
+        GAP + TEXT + GAP : GAP + TEXT + GAP + SIDE * HEIGHT // WIDTH, GAP + 5 * across : GAP + 5 * across + SIDE
+    ]
+    wanted = Image.fromarray(pictures[5]).resize((SIDE, SIDE * HEIGHT // WIDTH))
+    assert np.abs(shown.astype(int) - np.asarray(wanted)).mean() < 10
+    assert (rows[GAP + TEXT + GAP, GAP + 7 * across :] == 32).all()  # the first row has six photos
+
+    for photo in tmp_path.glob("noise *.png"):
+        photo.unlink()
+    for photo in tmp_path.glob("b *.png"):
+        photo.unlink()
+    assert find_cameras(tmp_path, quiet)["placed"] == 6
+    assert not sheet.parent.exists()
 
 
 def test_photos_of_a_phone(tmp_path, pictures):

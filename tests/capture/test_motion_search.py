@@ -9,6 +9,7 @@ import pytest
 
 from refgs.capture import colmap_steps, motion, read_capture, similar
 from refgs.capture.files import find_photos
+from refgs.capture.images import read_image
 from refgs.capture.motion import find_cameras
 from refgs.errors import InputError
 from tests.makers.captures import look_at, write
@@ -123,6 +124,19 @@ def test_photos_that_share_little_are_placed_together(two_sides):
     assert one_by_one < found["placed"] == len(poses) and not warnings
     distances, angles = pose_errors(read_capture(folder).views, poses)
     assert distances.max() < 0.1 and angles.max() < 2
+
+
+def test_a_search_finds_the_same_cameras_again(two_sides, tmp_path):
+    """Check that two searches in the same photos write the same model, byte for byte, placed together and one after the other."""
+    for photos in (14, 6):
+        models = []
+        for turn in range(2):
+            folder = tmp_path / f"{photos} {turn}"
+            for photo in find_photos(two_sides[0])[:photos]:
+                write(folder / photo.name, read_image(photo)[0])
+            find_cameras(folder, lambda *_: None)
+            models.append({file.name: file.read_bytes() for file in (folder / "sparse" / "0").iterdir()})
+        assert models[0] == models[1] and len(models[0]["points3D.bin"]) > 1000
 
 
 def test_photos_without_cameras_are_unexplained(tmp_path):

@@ -13,17 +13,22 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from scipy.sparse.csgraph import connected_components
 
 from refgs import CORES
 from refgs.capture.images import read_focal_length, read_header, read_image, read_mask, write_for_colmap
-from refgs.capture.similar import similar_pairs
+from refgs.capture.learned import read_matches
+from refgs.capture.similar import pairs_to_match
 
 SIDE = 1600  # pixels on the longer side for finding features; presets train on fewer
 ALL_PAIRS = 150  # photos; up to this many, every pair is matched
-NEXT = 5  # photos by name that each one is matched with where there are more
 CAMERA_MODEL = "RADIAL"  # with few photos a second focal length and tangential distortion only fit noise
 SEED = 1
+ONE_THREAD = (
+    1  # of cameras' computation: the sums of several differ from run to run, and with them which photos are placed
+)
 TIED = 3  # points that a photo must share with others; COLMAP asks for 30 where it places one photo after the other
+LINKED = 30  # matches between two photos of a group; COLMAP asks for as many where it places one photo after the other
 MATCH_TOLERANCE = 8.0  # pixels from its epipolar line, above which a match contradicts the cameras; COLMAP allows 4
 FEW_CAMERA_MODEL = "SIMPLE_RADIAL"  # of what tells little about the lens: see the next two
 WELL_SEEN = 10  # photos of one lens and size. 23 of a statue, cropped to 7 sizes, are all placed; with RADIAL, 3 are
@@ -35,34 +40,28 @@ INSIDE_FEATURES = (
 
 
 def choose_pairs(database: Path) -> list[tuple[int, int]]:
-    """Choose which photos in COLMAP's database to match. Returns pairs of photo indices. Photos are numbered in order of their file names.
+    """Choose which photos in COLMAP's database to match (see `pairs_to_match`). Returns pairs of photo indices.
 
-    With up to ALL_PAIRS photos, every pair is matched. With more, each photo is matched with two groups:
-
-    - Up to NEXT photos that follow it in this order. In a video, or a walk around the object, they were taken nearby.
-    - Some photos that look similar. They link several walks around the object. They also help if the file names do not follow the camera's
-      path.
+    Photos are numbered in order of their file names.
     """
     import pycolmap
 
     with pycolmap.Database.open(database) as known:
         images = {int(image.name): image.image_id for image in known.read_all_images()}
         photos = sorted(images)
-        if len(photos) <= ALL_PAIRS:
-            return list(combinations(photos, 2))
-        similar = similar_pairs(
-            lambda place: known.read_descriptors(images[photos[place]]).data, len(photos), beside=NEXT
-        )
-    following = {(a, b) for a in range(len(photos)) for b in range(a + 1, min(a + NEXT + 1, len(photos)))}
-    return sorted((photos[a], photos[b]) for a, b in following | similar)
+        pairs = pairs_to_match(len(photos), lambda place: known.read_descriptors(images[photos[place]]).data, ALL_PAIRS)
+    return [(photos[a], photos[b]) for a, b in pairs]
 
 
-def extract_features(photos: list[Path], masks: list[Path], database: Path, progress: Callable) -> None:
+def extract_features(
+    photos: list[Path], masks: list[Path], database: Path, progress: Callable, learned: Path | None = None
+) -> None:
     """Extract image features of all photos into COLMAP's database. If `masks` is not empty, keep only features inside the masks.
 
-    `masks` has a mask file for each photo, in the same order, or is empty. `progress("features", done, total)` is called for each batch of
-    photos. Photos with the same size and focal length (EXIF) share their intrinsics. COLMAP gets a temporary JPEG of a photo that it cannot
-    read. At the end the photos in the database are renamed to their indices, because names in COLMAP's file of pairs cannot have spaces.
+    `masks` has a mask file for each photo, in the same order, or is empty. If `learned` is given, a file by `learned.match_photos`, its
+    features are taken in place of SIFT's. `progress("features", done, total)` is called for each batch of photos. Photos with the same size
+    and focal length (EXIF) share their intrinsics. COLMAP gets a temporary JPEG of a photo that it cannot read. At the end the photos in
+    the database are renamed to their indices, because names in COLMAP's file of pairs cannot have spaces.
     """
     import pycolmap
 
@@ -73,6 +72,7 @@ def extract_features(photos: list[Path], masks: list[Path], database: Path, prog
     written = database.with_name(f"{database.name}.masks")
     if masks:
         reading.camera_model = INSIDE_CAMERA_MODEL
+    if masks and learned is None:
         reading.mask_path = written
         extraction.sift.peak_threshold = FAINT
         extraction.sift.max_num_features = INSIDE_FEATURES
@@ -91,7 +91,7 @@ def extract_features(photos: list[Path], masks: list[Path], database: Path, prog
                 # In a folder of its own, because a photo may be named 0.jpg.
                 folder, name = database.parent, f"{readable.name}/{number}.jpg"
             numbers[name] = str(number)
-            if masks:
+            if masks and learned is None:
                 _write_mask(photo, masks[number], written / f"{name}.png")
             camera = pycolmap.infer_camera_from_image(folder / name, reading)
             if focal := read_focal_length(photo):  # COLMAP knows only that for 35 mm film, in JPEG and PNG
@@ -101,13 +101,17 @@ def extract_features(photos: list[Path], masks: list[Path], database: Path, prog
                     cameras[_lens(camera)] = known.write_camera(camera)
             shared.setdefault((cameras[_lens(camera)], folder), []).append(name)
         for (reading.existing_camera_id, folder), names in shared.items():
-            pycolmap.extract_features(
-                database, folder, names, pycolmap.CameraMode.SINGLE, reading, extraction
-            )  # skips photos that have features already
+            # Number the images in the order of the photos. Threads number them as they finish, which leads to other cameras each time.
+            pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, names, reading)
+            if learned is None:
+                pycolmap.extract_features(
+                    database, folder, names, pycolmap.CameraMode.SINGLE, reading, extraction
+                )  # skips photos that have features already
         for path in readable.iterdir():
             path.unlink()
         shutil.rmtree(written, ignore_errors=True)
     readable.rmdir()
+    places = {} if learned is None else read_matches(learned)[0]
     with pycolmap.Database.open(database) as known, pycolmap.DatabaseTransaction(known):
         images = known.read_all_images()
         counts = Counter(image.camera_id for image in images)
@@ -118,6 +122,8 @@ def extract_features(photos: list[Path], masks: list[Path], database: Path, prog
         for image in images:
             image.name = numbers[image.name]
             known.update_image(image)
+            if places:
+                known.write_keypoints(image.image_id, places[int(image.name)])
 
 
 def _simplify(camera) -> None:
@@ -144,10 +150,11 @@ def _lens(camera) -> tuple[int, int, float]:
     return camera.width, camera.height, camera.mean_focal_length()
 
 
-def match_features(database: Path, progress: Callable) -> None:
+def match_features(database: Path, progress: Callable, learned: Path | None = None) -> None:
     """Match features within each pair of photos from `choose_pairs`. Store the matches in COLMAP's database.
 
-    `progress("matching", done, total)` is called for every 100 pairs.
+    If `learned` is given, a file by `learned.match_photos`, its matches are stored. `progress("matching", done, total)` is called for every
+    100 pairs.
     """
     import pycolmap
 
@@ -157,11 +164,28 @@ def match_features(database: Path, progress: Callable) -> None:
     listed = database.with_name(database.name + ".pairs.txt")
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(listed)
-    all_pairs = [f"{a} {b}" for a, b in choose_pairs(database)]
+    matches = {} if learned is None else read_matches(learned)[1]
+    all_pairs = choose_pairs(database) if learned is None else sorted(matches)
     for start in range(0, len(all_pairs), 100):
         progress("matching", start, len(all_pairs))
-        listed.write_text("\n".join(all_pairs[start : start + 100]), encoding="utf-8")
-        pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
+        pairs = all_pairs[start : start + 100]
+        listed.write_text("\n".join(f"{a} {b}" for a, b in pairs), encoding="utf-8")
+        if learned is None:
+            pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
+        else:
+            _write_matches(database, {pair: matches[pair] for pair in pairs})
+            pycolmap.verify_matches(database, listed, verification)
+
+
+def _write_matches(database: Path, matches: dict[tuple[int, int], np.ndarray]) -> None:
+    """Write the matches (N, 2) of pairs of photo indices into COLMAP's database. Pairs that it has already stay."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as known, pycolmap.DatabaseTransaction(known):
+        images = {int(image.name): image.image_id for image in known.read_all_images()}
+        for (a, b), matched in matches.items():
+            if not known.exists_matches(images[a], images[b]):
+                known.write_matches(images[a], images[b], matched)
 
 
 def map_one_by_one(photos: list[Path], database: Path, progress: Callable) -> list[Any]:
@@ -173,7 +197,7 @@ def map_one_by_one(photos: list[Path], database: Path, progress: Callable) -> li
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = SEED
+    options.random_seed, options.num_threads = SEED, ONE_THREAD
     options.min_model_size = 3
     options.extract_colors = False
     placed = 0
@@ -204,7 +228,7 @@ def map_at_once(photos: list[Path], database: Path) -> list[Any]:
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
-    options.random_seed = SEED
+    options.random_seed, options.num_threads = SEED, ONE_THREAD
     written = database.with_name(database.name + ".models")
     models = pycolmap.global_mapping(database, photos[0].parent, written, options)
     for model in models.values():
@@ -282,6 +306,27 @@ def unexplained_part(model: Any, database: Path) -> float:
             )
             wrong += int((far > MATCH_TOLERANCE).sum())
     return wrong / max(total, 1)
+
+
+def linked_groups(database: Path) -> list[list[int]]:
+    """Return the photos that hang together: groups of photo indices, the largest group first, sorted in each group.
+
+    Two photos are linked if they have at least LINKED matches that fit one epipolar geometry. A group has all photos that are linked
+    directly or by others. A photo without links is a group of its own.
+    """
+    import pycolmap
+
+    with pycolmap.Database.open(database) as known:
+        numbers = {image.image_id: int(image.name) for image in known.read_all_images()}
+        verified = list(zip(*known.read_two_view_geometries(), strict=True))
+    links = np.zeros((len(numbers), len(numbers)), bool)
+    for pair, geometry in verified:
+        if len(geometry.inlier_matches) >= LINKED:
+            a, b = pycolmap.pair_id_to_image_pair(pair)
+            links[numbers[a], numbers[b]] = True
+    _, labels = connected_components(links, directed=False)
+    groups = [np.flatnonzero(labels == label).tolist() for label in range(labels.max() + 1)]
+    return sorted(groups, key=len, reverse=True)
 
 
 def color_points(model: Any, photos: list[Path]) -> None:

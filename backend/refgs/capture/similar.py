@@ -7,6 +7,7 @@ milliseconds; matching the features of two photos takes tenths of a second.
 """
 
 from collections.abc import Callable
+from itertools import combinations
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
@@ -14,7 +15,23 @@ from scipy.cluster.vq import kmeans2
 WORDS = 256
 SAMPLE = 200  # features of each photo that the means are made of
 ROUNDS = 10  # of k-means
+NEXT = 5  # photos by name that each one is matched with where there are many
 RANKS = *range(8), 9, 11, 14, 18, 24, 32, 43  # by likeness, of the photos that each one is paired with
+
+
+def pairs_to_match(count: int, read: Callable[[int], np.ndarray], all_pairs: int) -> list[tuple[int, int]]:
+    """Choose which of `count` photos to match. Returns pairs of indices, the smaller one first, sorted.
+
+    With up to `all_pairs` photos, every pair is matched. With more, each photo is matched with two groups:
+
+    - Up to NEXT photos that follow it. In a video, or a walk around the object, they were taken nearby.
+    - Some photos that look similar (see `similar_pairs`, which calls `read`). They link several walks around the object. They also help if
+      the file names do not follow the camera's path.
+    """
+    if count <= all_pairs:
+        return list(combinations(range(count), 2))
+    following = {(a, b) for a in range(count) for b in range(a + 1, min(a + NEXT + 1, count))}
+    return sorted(following | similar_pairs(read, count, beside=NEXT))
 
 
 def similar_pairs(read: Callable[[int], np.ndarray], count: int, beside: int) -> set[tuple[int, int]]:
