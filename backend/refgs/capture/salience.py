@@ -18,8 +18,8 @@ from refgs.errors import InputError, reason
 MODEL = Path(__file__).with_name("isnet.onnx")  # RefGS's own; `scripts/fetch_model.py` brings it
 SIDE = 1024  # pixels that a model of any size gets
 # Mean and standard deviation of the 8-bit values: as MODEL was trained, and of ImageNet.
-OURS = np.float32([128, 128, 128]), np.float32([256, 256, 256])
-IMAGENET = np.float32([123.675, 116.28, 103.53]), np.float32([58.395, 57.12, 57.375])
+OURS = np.array([128, 256], np.float32)
+IMAGENET = np.array([[123.675, 116.28, 103.53], [58.395, 57.12, 57.375]], np.float32)
 
 
 class SalienceModel:
