@@ -40,6 +40,7 @@ DISTRUSTED, TRUSTED = (
     0.7,
 )  # overlap of the model's object with the shape, up to which and from which on the model counts
 WIDER = 2.0  # times the guessed box, in which the model's object is looked for
+BESIDE = 0.3  # part of the largest object's volume, weighted by nearness to the middle, from which on another one is in the box
 MARGIN = 1.3  # times the object that the model finds, for the box around it
 UNKNOWN = 0.02  # likelihood of a colour that nothing is known of
 LEVELS = (20, 32, 32)  # bins of the histograms, in Lab
@@ -152,9 +153,10 @@ def carve_object(photos: list[Photo], box: Box, fill: float, backdrop: Backdrop 
 
 
 def find_box(photos: list[Photo], box: Box) -> Box:
-    """Return the box, parallel to the axes, of the object that the model finds near the middle of `box`; `box` itself if none.
+    """Return the box, parallel to the axes, around what the model finds near the middle of `box`; `box` itself if it finds nothing.
 
-    A guessed box may cut the object, or be so large that the object has few voxels. Photos must have `salient`.
+    A guessed box may cut the object, or be so large that the object has few voxels. Several objects are taken if they are about as large
+    and as near to the middle. Photos must have `salient`.
     """
     wide = Box(box.matrix @ np.diag([WIDER, WIDER, WIDER, 1.0]))
     points = wide.grid(GRID)
@@ -166,7 +168,7 @@ def find_box(photos: list[Photo], box: Box) -> Box:
         return box
     aside = np.linalg.norm(np.linalg.solve(wide.matrix[:3, :3], (points - wide.centre).T), axis=0)
     weight = np.bincount(parts.ravel(), np.where(parts.ravel() > 0, np.maximum(1 - aside, 1e-6), 0))
-    found = points[parts.ravel() == weight.argmax()]
+    found = points[(weight >= BESIDE * weight.max())[parts.ravel()]]
     low, high = found.min(axis=0), found.max(axis=0)
     voxel = np.abs(points[0] - points[-1]).max() / (GRID - 1)
     matrix = np.diag([*(MARGIN * (high - low) / 2 + 2 * voxel), 1.0])
@@ -209,7 +211,10 @@ def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
     labels[photo.known > 0] = cv2.GC_FGD
     labels[photo.known < 0] = cv2.GC_BGD
     if photo.salient is not None and _trust(photo.salient, prior) > 0.5:  # it knows the edge better than colours do
-        mask = _only_connected((likely | (core & (posterior > 0.2))) & around, solid > 0, photo.known)
+        # A hole where model and colours agree on the surroundings is one, though the coarse shape closes it: a mug's handle.
+        mask = _only_connected(
+            (likely | (core & (posterior > 0.2))) & around, (solid > 0) & (posterior > 0.1), photo.known
+        )
         return np.where(mask, np.uint8(255), np.uint8(0))
     rows, columns = (np.flatnonzero(around.any(axis=axis)) for axis in (1, 0))
     if len(rows):
@@ -377,7 +382,7 @@ def _posterior(
     if (
         photo.salient is not None
     ):  # it misses parts that colours find, and finds parts that have no colours of their own
-        evidence += _trust(photo.salient, prior) * np.clip(_of_model(photo.salient), -4, 4)
+        evidence += _trust(photo.salient, prior) * np.clip(_of_model(photo.salient), -3, 3)
     odds = np.clip(prior, 0.1, 0.9)
     result = 1 / (1 + np.exp(-(evidence + 0.7 * np.log(odds / (1 - odds)))))
     return np.where(photo.known > 0, 0.999, np.where(photo.known < 0, 0.001, result))
