@@ -203,7 +203,7 @@ def _install(home: Path, uv: Path, trainer: Path) -> None:
         said = _describe_origin(_resolve(program, variables, home, lock))
     else:
         said = "This add-on has no lock of a release: the packages were not checked"
-        _run_uv(program, variables, home, *install, f"{trainer}[farm,onnx]")
+        _run_uv(program, variables, home, *install, f"{trainer}[farm]")
     _emit("stage", what=said, part=0.99)
     print(said, file=sys.stderr, flush=True)  # the log
     _emit("stage", what="Starting the trainer for the first time", part=0.99)

@@ -36,7 +36,7 @@ class Preferences(bpy.types.AddonPreferences):
     mask_model: StringProperty(
         name="Mask Model",
         description="ONNX file of a model that segments salient objects, such as BiRefNet. "
-        "If left empty, Make Masks finds the object by colours",
+        "If left empty, Make Masks uses the model that comes with RefGS",
         subtype="FILE_PATH",
     )
 

@@ -24,7 +24,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PLATFORMS = {"linux-x64": "manylinux2014_x86_64", "windows-x64": "win_amd64", "macos-arm64": "macosx_11_0_arm64"}
 TORCH_BUILDS = ("cpu", "cu126", "cu128", "cu129", "cu130", "cu132")  # as uv names them; each has an index of its own
-LARGEST = 60e6  # bytes of a zip, at most
+LARGEST = 150e6  # bytes of a zip, at most
 
 
 def call(*arguments: str | Path) -> tuple[int, str]:
@@ -51,7 +51,7 @@ def blender_tool() -> Path:
 
 
 def build_trainer(source: Path, wheels: Path) -> None:
-    """Build the trainer's wheel, with its presets, and write it into the folder `wheels`.
+    """Build the trainer's wheel, with its presets and its segmentation model, and write it into the folder `wheels`.
 
     The code is first copied into the folder `source`, without files that earlier builds left.
     """
@@ -63,12 +63,12 @@ def build_trainer(source: Path, wheels: Path) -> None:
 
 
 def write_locks(project: Path, folder: Path) -> None:
-    """Lock the packages that a `project`, a pyproject.toml with extras `farm` and `onnx`, needs now. Write the locks into a folder.
+    """Lock the packages that a `project`, a pyproject.toml with the extra `farm`, needs now. Write the locks into a folder.
 
     `lock.txt` is for torch of the package index, `lock-BUILD.txt` for a build of torch that has an index of its own. A build that does not
     exist, or whose index cannot be reached, gets none: machines that it is for then take torch from the package index.
     """
-    how = ["-m", "uv", "pip", "compile", project, "--extra", "farm", "--extra", "onnx"]
+    how = ["-m", "uv", "pip", "compile", project, "--extra", "farm"]
     how += ["--universal", "--python-version", "3.11"]
     how += ["--generate-hashes", "--only-binary", ":all:", "--no-header", "--no-annotate", "--quiet"]
     run(*how, "--output-file", folder / "lock.txt")
@@ -110,6 +110,7 @@ def main() -> None:
         for tag in PLATFORMS.values():
             only = ("--only-binary", ":all:", "--platform", tag)
             run("-m", "pip", "download", "--quiet", "--no-deps", *only, "--dest", wheels, f"uv=={version('uv')}")
+        run(ROOT / "scripts" / "fetch_model.py")
         build_trainer(folder / "trainer", wheels)
         write_locks(ROOT / "pyproject.toml", wheels)
         stage(folder / "extension", wheels)

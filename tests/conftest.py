@@ -15,6 +15,7 @@ import pytest
 import torch._dynamo  # load Triton's LLVM before Mesa's, which Eevee uses: the other order crashes
 
 from benchmarks.scenes.analytic import write_ball_capture
+from refgs.capture import salience
 from refgs.kernels import load
 from tests.makers.emulate import emulate
 from tests.makers.foreign import use_foreign
@@ -33,6 +34,12 @@ def no_package_of_the_clone() -> None:
     """
     parent = str(Path(__file__).parents[2])
     sys.path[:] = [folder for folder in sys.path if folder != parent]
+
+
+@pytest.fixture(autouse=True)
+def no_model(monkeypatch) -> None:
+    """Let masks be made by colours, as where the segmentation model is not installed: it takes seconds for a photo."""
+    monkeypatch.setattr(salience, "MODEL", Path("no model"))
 
 
 @pytest.fixture(params=CARDS)

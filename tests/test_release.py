@@ -41,7 +41,7 @@ def test_locks_hold_what_the_trainer_needs_and_no_address(archives):
     for archive in archives.values():
         lock = zipfile.ZipFile(archive).read("wheels/lock.txt").decode()
         lines = {line.partition(" ")[0] for line in lock.splitlines()}
-        assert pinned <= lines and "onnxruntime" in {line.partition("==")[0] for line in lines}
+        assert pinned <= lines
         assert "://" not in lock
 
 

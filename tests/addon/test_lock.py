@@ -18,7 +18,7 @@ WORKER = f"""print('{{"event": "ready", "protocol": {jobs.PROTOCOL}, "refgs": "9
 def write_wheel(folder, name, version, code, requires=()):
     """Write a wheel of one module, and beside it the page of a package index that names it."""
     made, about = folder / f"{name}-{version}-py3-none-any.whl", f"{name}-{version}.dist-info"
-    metadata = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\nProvides-Extra: onnx\nProvides-Extra: farm\n"
+    metadata = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\nProvides-Extra: farm\n"
     files = {
         f"{name}.py" if name != "refgs" else "refgs/cli.py": code,
         f"{about}/METADATA": metadata + "".join(f"Requires-Dist: {line}\n" for line in requires),
@@ -51,7 +51,7 @@ def release(tmp_path, monkeypatch):
     project = tmp_path / "pyproject.toml"
     project.write_text(
         '[project]\nname = "refgs"\nversion = "9.9"\nrequires-python = ">=3.11"\ndependencies = ["torch==2.14.0"]\n'
-        "[project.optional-dependencies]\nonnx = []\nfarm = []\n"
+        "[project.optional-dependencies]\nfarm = []\n"
     )
     monkeypatch.setattr("scripts.build_extension.TORCH_BUILDS", ())
     write_locks(project, wheels)

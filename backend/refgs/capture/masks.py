@@ -20,7 +20,7 @@ from PIL import Image
 from pydantic import TypeAdapter
 
 from refgs.camera import Camera
-from refgs.capture import View, load_view, read_files, to_run_frame
+from refgs.capture import View, load_view, read_files, salience, to_run_frame
 from refgs.capture.backdrop import Backdrop, find_plane
 from refgs.capture.box import Box
 from refgs.capture.cameras import mask_names
@@ -29,7 +29,7 @@ from refgs.capture.images import read_image
 from refgs.capture.lens import Lens
 from refgs.capture.region import LOOK_OUT, WHITE_MASKS, find_region, sample_silhouettes, up_direction
 from refgs.capture.salience import SalienceModel
-from refgs.capture.silhouettes import Photo, carve_object, cut_out
+from refgs.capture.silhouettes import Photo, carve_object, cut_out, find_box
 from refgs.capture.triangulate import triangulate
 from refgs.capture.types import Z_UP, Capture, CaptureFiles
 from refgs.errors import InputError
@@ -57,7 +57,8 @@ def make_masks(
 
     `wanted` may set a box around the object, as for `read_capture`. Its up direction is not used. Without a box, the object is guessed
     (`guess_box`), and the guess is reported as the event "region". `report(event, facts)` is also called with "progress" and "warning".
-    `model` is an ONNX file (`SalienceModel`) that finds the object's pixels. Without a model, the object is found by colours.
+    `model` is an ONNX file (`SalienceModel`) that finds the object's pixels in place of RefGS's own, MODEL. Without any, the object is
+    found by colours, and a warning says so.
 
     Returns a dict:
 
@@ -86,7 +87,7 @@ def with_masks(
     Return `files` with the new masks, and the dict that `make_masks` returns.
     """
     folder = files.folder
-    judge = _Judge(SalienceModel(model)) if model is not None else None
+    judge = _find_judge(model, report)
     capture = to_run_frame(files, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
     root = _root(capture)
     _check_writable(root)
@@ -126,6 +127,8 @@ def with_masks(
     nothing = InputError(
         f"{folder}: no object was found. Set a box about it (region.size), or draw strokes on some photos."
     )
+    if judge is not None and not capture.box:
+        box = find_box(photos, box)
     shape = carve_object(photos, box, fill, backdrop, carving)
     if shape is None:
         raise nothing
@@ -299,6 +302,14 @@ def _stroke_file(view: View, root: Path) -> Path | None:
     name = _inner(view, root)
     files = (root / "strokes" / name.with_suffix(".png"), root / "strokes" / name.with_name(name.name + ".png"))
     return next((file for file in files if file.is_file()), None)
+
+
+def _find_judge(model: Path | None, report: Report) -> "_Judge | None":
+    if model is None and not salience.MODEL.is_file():
+        what = "the object is looked for by its colours, for the segmentation model is not installed: python scripts/fetch_model.py"
+        report("warning", {"what": what})
+        return None
+    return _Judge(SalienceModel(model or salience.MODEL))
 
 
 class _Judge:

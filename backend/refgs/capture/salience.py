@@ -1,12 +1,10 @@
-"""Run a segmentation model that the artist supplies as an ONNX file: it finds the object's pixels in a single photo.
+"""Run a segmentation model, which finds the object's pixels in a single photo: RefGS's own, or an ONNX file that the artist supplies.
 
 ONNX Runtime runs in a child process, because it ends its process for some damaged files.
 """
 
-import importlib.util
 import multiprocessing
 import signal
-import sys
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -17,30 +15,26 @@ import numpy as np
 
 from refgs.errors import InputError, reason
 
+MODEL = Path(__file__).with_name("isnet.onnx")  # RefGS's own; `scripts/fetch_model.py` brings it
 SIDE = 1024  # pixels that a model of any size gets
-MEAN, DEVIATION = (
-    np.array([0.485, 0.456, 0.406], np.float32),
-    np.array([0.229, 0.224, 0.225], np.float32),
-)  # of ImageNet's sRGB values in 0..1
+# Mean and standard deviation of the 8-bit values: as MODEL was trained, and of ImageNet.
+OURS = np.array([128, 256], np.float32)
+IMAGENET = np.array([[123.675, 116.28, 103.53], [58.395, 57.12, 57.375]], np.float32)
 
 
 class SalienceModel:
     """Model of salient-object segmentation, such as U²-Net, IS-Net or BiRefNet, on the CPU.
 
-    The model's input is a photo (1, 3, height, width) float32 RGB, normalised as for ImageNet. Its first output is one number for each
-    pixel. If any of these numbers is negative, they are all logits. If none is negative but one is greater than 1, they are all scaled to
-    0..1. Otherwise they are probabilities. `side` is the longer side of the input, in pixels. Raises InputError if the file is
-    missing, damaged or another type of model, or if ONNX Runtime is not installed.
+    The model's input is a photo (1, 3, height, width) float32 RGB. Its values are normalised as for ImageNet; those of MODEL, as it was
+    trained. Its first output is one number for each pixel. If any of these numbers is negative, they are all logits. If none is negative
+    but one is greater than 1, they are all scaled to 0..1. Otherwise they are probabilities. `side` is the longer side of the input, in
+    pixels. Raises InputError if the file is missing, damaged or another type of model.
     """
 
     def __init__(self, file: Path):
         self.file = Path(file)
         if not self.file.is_file():
             raise InputError(f"{file}: there is no such file. --model needs a model in ONNX format.")
-        if importlib.util.find_spec("onnxruntime") is None:
-            raise InputError(
-                f"{file}: models need ONNX Runtime. Install it: {sys.executable} -m pip install onnxruntime"
-            )
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         # It ends when the pipe is closed, at the latest with this object.
@@ -114,7 +108,8 @@ def _load(file: Path) -> tuple[Any, tuple[int, int]]:
 
 def _run(file: Path, session: Any, image: np.ndarray) -> np.ndarray:
     """Return the object's probability at each pixel (H, W) of a photo (H, W, 3) uint8 that has the size of the model's input."""
-    batch = np.ascontiguousarray(((image.astype(np.float32) / 255 - MEAN) / DEVIATION).transpose(2, 0, 1)[None])
+    mean, deviation = OURS if file == MODEL else IMAGENET
+    batch = np.ascontiguousarray(((image - mean) / deviation).transpose(2, 0, 1)[None])
     try:
         found = session.run([session.get_outputs()[0].name], {session.get_inputs()[0].name: batch})[0]
         shape, found = np.shape(found), np.asarray(found, np.float32).squeeze()

@@ -6,7 +6,8 @@ the probability that it lies in the object. Two steps alternate:
 - Project the voxels into the photos, and learn two colour histograms there: of the object, and of its surroundings.
 - Keep the voxels at which nearly all photos show the object's colours.
 
-GrabCut (OpenCV) then finds the exact edges.
+GrabCut (OpenCV) then finds the exact edges. A segmentation model's probabilities, if there are any, are added to what the colours say, as
+far as they agree with the shape. They also give the first shape, and the edges of the photos in which they agree.
 
 A highlight can look like a hole, so two neighbouring photos are compared. A voxel in a hole shows the surroundings' colours in both photos.
 A voxel at a highlight shows them in only one photo, because the highlight moves over the surface.
@@ -34,6 +35,13 @@ NEAR = 0.2  # probability from which a pixel may be object, so that thin parts, 
 SEEN = 0.3  # part of the photos that must show a voxel
 COUNTED = 0.1  # part of the largest object's volume, from which on another one is an object too
 LEARNED = (0, 1, 3)  # rounds in which the plane's texture is learned
+DISTRUSTED, TRUSTED = (
+    0.3,
+    0.7,
+)  # overlap of the model's object with the shape, up to which and from which on the model counts
+WIDER = 2.0  # times the guessed box, in which the model's object is looked for
+BESIDE = 0.3  # part of the largest object's volume, weighted by nearness to the middle, from which on another one is in the box
+MARGIN = 1.3  # times the object that the model finds, for the box around it
 UNKNOWN = 0.02  # likelihood of a colour that nothing is known of
 LEVELS = (20, 32, 32)  # bins of the histograms, in Lab
 
@@ -43,7 +51,7 @@ class Photo:
     """Hold a reduced photo: `image` (H, W, 3) uint8 RGB, and its pinhole `camera`.
 
     `known` (H, W) int8 is 1 where an artist's mask or stroke marks the object, −1 where it marks the background, and 0 elsewhere. `salient`
-    (H, W), if given, is the object's probability by a segmentation model. It is then used in place of the pixel's colour.
+    (H, W), if given, is the object's probability by a segmentation model.
     """
 
     image: np.ndarray
@@ -93,18 +101,20 @@ def carve_object(photos: list[Photo], box: Box, fill: float, backdrop: Backdrop 
     """Carve the object in a box out of the photos. Return None if nothing is left.
 
     The first guess is an ellipsoid, whose axes are the fraction `fill` of the box's edges. `backdrop` is the plane that carries the object,
-    or None. The plane's colours are learned here, unless photos have `salient`. `progress(done, total)` is called after each round.
+    or None. The plane's colours are learned here. `progress(done, total)` is called after each round.
     """
     points = box.grid(GRID)
-    centred = np.linalg.norm(np.linalg.solve(box.matrix[:3, :3], (points - box.centre).T), axis=0)
-    occupied = np.clip(1.3 - 1.25 * centred / fill, 0.0, 0.85)
-    allowed = np.ones(len(points), bool) if backdrop is None else backdrop.before(points)
-    occupied[~allowed] = 0
-    if any(photo.salient is not None for photo in photos):
-        backdrop = None
     pixels = [_pixels(points, photo.camera) for photo in photos]
     seen = cast(np.ndarray, sum((at >= 0).astype(int) for at in pixels))
-    allowed &= seen >= max(2, SEEN * len(photos))
+    allowed = seen >= max(2, SEEN * len(photos))
+    if backdrop is not None:
+        allowed &= backdrop.before(points)
+    if any(photo.salient is not None for photo in photos):
+        occupied = np.clip(_by_model(photos, pixels, seen), 0, 0.85)
+    else:
+        centred = np.linalg.norm(np.linalg.solve(box.matrix[:3, :3], (points - box.centre).T), axis=0)
+        occupied = np.clip(1.3 - 1.25 * centred / fill, 0.0, 0.85)
+    occupied[~allowed] = 0
     pairs = _neighbours(photos, box.centre)
     disagree = DISAGREE if backdrop is None else DISAGREE_PLANE
     shape, colors = None, None
@@ -142,6 +152,44 @@ def carve_object(photos: list[Photo], box: Box, fill: float, backdrop: Backdrop 
     return shape
 
 
+def find_box(photos: list[Photo], box: Box) -> Box:
+    """Return the box, parallel to the axes, around what the model finds near the middle of `box`; `box` itself if it finds nothing.
+
+    A guessed box may cut the object, or be so large that the object has few voxels. Several objects are taken if they are about as large
+    and as near to the middle. Photos must have `salient`.
+    """
+    wide = Box(box.matrix @ np.diag([WIDER, WIDER, WIDER, 1.0]))
+    points = wide.grid(GRID)
+    pixels = [_pixels(points, photo.camera) for photo in photos]
+    seen = cast(np.ndarray, sum((at >= 0).astype(int) for at in pixels))
+    likely = _by_model(photos, pixels, seen)
+    parts, count = cast(tuple[np.ndarray, int], label(likely.reshape(GRID, GRID, GRID) > 0.5))
+    if count == 0:
+        return box
+    aside = np.linalg.norm(np.linalg.solve(wide.matrix[:3, :3], (points - wide.centre).T), axis=0)
+    weight = np.bincount(parts.ravel(), np.where(parts.ravel() > 0, np.maximum(1 - aside, 1e-6), 0))
+    found = points[(weight >= BESIDE * weight.max())[parts.ravel()]]
+    low, high = found.min(axis=0), found.max(axis=0)
+    voxel = np.abs(points[0] - points[-1]).max() / (GRID - 1)
+    matrix = np.diag([*(MARGIN * (high - low) / 2 + 2 * voxel), 1.0])
+    matrix[:3, 3] = (low + high) / 2
+    return Box(matrix)
+
+
+def _by_model(photos: list[Photo], pixels: list[np.ndarray], seen: np.ndarray) -> np.ndarray:
+    """Return the probability (GRID³,) that voxels are in the object, by the model alone.
+
+    `pixels` are the results of `_pixels`, and `seen` (GRID³,) is the number of photos that see a voxel.
+    """
+    total = np.zeros(len(seen))
+    for photo, at in zip(photos, pixels, strict=True):
+        if photo.salient is not None:
+            total[at >= 0] += photo.salient.ravel()[at[at >= 0]]
+    mean = np.where(seen >= max(2, SEEN * len(photos)), total / np.maximum(seen, 1), 0)
+    # Relative to the largest mean: in some photos the model may take something else.
+    return np.clip((mean / max(mean.max(), 1e-6) - 0.6) / 0.4, 0, 1)
+
+
 def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
     """Find the silhouette's exact edge in a photo. Return the mask (H, W) uint8, 0 or 255."""
     prior = shape.project(photo.camera)
@@ -162,6 +210,12 @@ def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
     labels[~around] = cv2.GC_BGD
     labels[photo.known > 0] = cv2.GC_FGD
     labels[photo.known < 0] = cv2.GC_BGD
+    if photo.salient is not None and _trust(photo.salient, prior) > 0.5:  # it knows the edge better than colours do
+        # A hole where model and colours agree on the surroundings is one, though the coarse shape closes it: a mug's handle.
+        mask = _only_connected(
+            (likely | (core & (posterior > 0.2))) & around, (solid > 0) & (posterior > 0.1), photo.known
+        )
+        return np.where(mask, np.uint8(255), np.uint8(0))
     rows, columns = (np.flatnonzero(around.any(axis=axis)) for axis in (1, 0))
     if len(rows):
         # GrabCut takes seconds for a large picture: it gets the shape and a margin about it.
@@ -320,14 +374,28 @@ def _posterior(
 ) -> np.ndarray:
     """Return the probability that each pixel shows the object, (H, W).
 
-    Two sources are combined. One is the shape's projection `prior`. The other is `salient`, the probability by a segmentation model. If the
-    photo has no `salient`, the pixel's colour is used. It is compared with three things: the histograms of all photos, the histograms of
-    this photo, and the bare plane.
+    Two sources are combined. One is the shape's projection `prior`. The other is the photo: the pixel's colour, and how well it fits the
+    histograms of all photos, those of this photo, and the bare plane; and the model's probability, if the photo has `salient`. The model
+    counts as much as it agrees with the shape: `_trust`.
     """
-    evidence = _of_colors(photo, prior, plain, colors) if photo.salient is None else _of_model(photo.salient)
+    evidence = np.clip(_of_colors(photo, prior, plain, colors), -3, 3)
+    if (
+        photo.salient is not None
+    ):  # it misses parts that colours find, and finds parts that have no colours of their own
+        evidence += _trust(photo.salient, prior) * np.clip(_of_model(photo.salient), -3, 3)
     odds = np.clip(prior, 0.1, 0.9)
-    result = 1 / (1 + np.exp(-(np.clip(evidence, -3, 3) + 0.7 * np.log(odds / (1 - odds)))))
+    result = 1 / (1 + np.exp(-(evidence + 0.7 * np.log(odds / (1 - odds)))))
     return np.where(photo.known > 0, 0.999, np.where(photo.known < 0, 0.001, result))
+
+
+def _trust(salient: np.ndarray, prior: np.ndarray) -> float:
+    """Return how far a photo's `salient` (H, W) agrees with the shape's projection `prior` (H, W), 0..1.
+
+    Agreement is the overlap (intersection over union): 0 up to DISTRUSTED, as where the model took something else, and 1 from TRUSTED on.
+    """
+    inside = prior > 0.5
+    overlap = np.where(inside, salient, 0).sum() / max((inside | (salient > 0.5)).sum(), 1)
+    return float(np.clip((overlap - DISTRUSTED) / (TRUSTED - DISTRUSTED), 0, 1))
 
 
 def _of_model(salient: np.ndarray) -> np.ndarray:
