@@ -48,6 +48,14 @@ class RenderInputs(NamedTuple):
         return self.environment
 
 
+class Lines(dict[str, str]):
+    """Hold lines for the artist by what was decided. `details` are the topics whose lines only the log has."""
+
+    def __init__(self):
+        super().__init__()
+        self.details: set[str] = set()
+
+
 class State:
     """Hold the state of a training: the capture, what it learns, and the decisions that it has made.
 
@@ -70,8 +78,7 @@ class State:
         self.crops: list[Crop] | None = None  # the parts of the photos that are trained on; None: all of them
         self.iteration, self.total = 0, self.settings.train.iterations
         self.seconds = 0.0
-        self.decided: dict[str, str] = {}  # lines for the artist, by what was decided
-        self.details: set[str] = set()  # those of these decisions whose line is a detail
+        self.decided = Lines()
         self.needs: dict[str, Found] = {}  # the decisions of `train/decide`, by the need's name
         self.initial = self.method.deferred and self.settings.initial.until > 0  # the initial stage is not over yet
         self.residual = False  # the residual learns (see `residual_start`)
@@ -186,8 +193,8 @@ class State:
         A `detail` is only logged (see `events.Report`), unless it replaces a line that was shown.
         """
         if self.decided.get(about) != what:
-            detail = detail and (about in self.details or about not in self.decided)
-            self.details = self.details | {about} if detail else self.details - {about}
+            detail = detail and (about in self.decided.details or about not in self.decided)
+            (self.decided.details.add if detail else self.decided.details.discard)(about)
             self.decided[about] = what
             self.report("decided", {"about": about, "what": what, "detail": detail})
 

@@ -27,7 +27,7 @@ def save(state: State) -> None:
     facts = {"seconds": state.seconds, "total": state.total, "initial": state.initial, "residual": state.residual}
     facts |= {"clock": state.clock.seconds, "spent": state.plan.spent, "processor_seconds": state.clock.processor}
     found = {name: found.model_dump(exclude_none=True) for name, found in state.needs.items()}
-    facts |= {"decided": state.decided, "details": sorted(state.details), "needs": found, "parts": parts}
+    facts |= {"decided": state.decided, "details": sorted(state.decided.details), "needs": found, "parts": parts}
     checkpoint.save(state.folder / "checkpoints", state.iteration, tensors, facts)
 
 
