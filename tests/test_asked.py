@@ -44,7 +44,7 @@ def test_the_command_line_of_a_training_asks_for_it(monkeypatch, words):
     heard = []
     monkeypatch.setattr(commands, "train", lambda *given: heard.append(given))
     cli.app(Asked(*HOW, **words).words(), standalone_mode=False)
-    assert heard == [(Asked(*HOW, **words), False)]
+    assert heard == [(Asked(*HOW, **words), False, False)]  # neither --once nor --verbose
 
 
 def test_each_change_is_parsed_once(monkeypatch):
