@@ -79,7 +79,7 @@ class Told:
 
 def made_with(folder, monkeypatch, likely):
     """Make masks with a model that says `likely` (H, W) of each photo. Returns the masks."""
-    monkeypatch.setattr(masks, "_find_judge", lambda model, report: Told([np.float32(array) for array in likely]))
+    monkeypatch.setattr(masks, "_find_judge", lambda model: Told([np.float32(array) for array in likely]))
     masks.make_masks(folder, None, lambda event, facts: None)
     return read_masks(folder)
 

@@ -58,7 +58,7 @@ def make_masks(
     `wanted` may set a box around the object, as for `read_capture`. Its up direction is not used. Without a box, the object is guessed
     (`guess_box`), and the guess is reported as the event "region". `report(event, facts)` is also called with "progress" and "warning".
     `model` is an ONNX file (`SalienceModel`) that finds the object's pixels in place of RefGS's own, MODEL. Without any, the object is
-    found by colours, and a warning says so.
+    found by colours, and "region" says so.
 
     Returns a dict:
 
@@ -87,7 +87,7 @@ def with_masks(
     Return `files` with the new masks, and the dict that `make_masks` returns.
     """
     folder = files.folder
-    judge = _find_judge(model, report)
+    judge = _find_judge(model)
     capture = to_run_frame(files, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
     root = _root(capture)
     _check_writable(root)
@@ -111,7 +111,10 @@ def with_masks(
     else:
         box, fill, size = guess_box(capture, views)
         guessed = region_settings(box)
-        report("region", {"region": guessed, "what": f"looking for the object in the box {' '.join(guessed)}"})
+        what = f"looking for the object in the box {' '.join(guessed)}"
+        if judge is None:
+            what += ", by its colours: python scripts/fetch_model.py brings a model that knows objects"
+        report("region", {"region": guessed, "what": what})
     points = triangulate(chosen, reading) if capture.points is None else capture.points
     positions = np.array([view.camera.position for view in views])
     plane = find_plane(points, box.centre, size, up_direction(views), positions)
@@ -304,10 +307,9 @@ def _stroke_file(view: View, root: Path) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
-def _find_judge(model: Path | None, report: Report) -> "_Judge | None":
+def _find_judge(model: Path | None) -> "_Judge | None":
+    """Load the artist's model, or RefGS's own. Return None if neither is there."""
     if model is None and not salience.MODEL.is_file():
-        what = "the object is looked for by its colours, for the segmentation model is not installed: python scripts/fetch_model.py"
-        report("warning", {"what": what})
         return None
     return _Judge(SalienceModel(model or salience.MODEL))
 
