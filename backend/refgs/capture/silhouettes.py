@@ -35,10 +35,8 @@ NEAR = 0.2  # probability from which a pixel may be object, so that thin parts, 
 SEEN = 0.3  # part of the photos that must show a voxel
 COUNTED = 0.1  # part of the largest object's volume, from which on another one is an object too
 LEARNED = (0, 1, 3)  # rounds in which the plane's texture is learned
-DISTRUSTED, TRUSTED = (
-    0.3,
-    0.7,
-)  # overlap of the model's object with the shape, up to which and from which on the model counts
+# Overlap of the model's object with the shape, up to which the model does not count, and from which on it counts fully.
+DISTRUSTED, TRUSTED = 0.3, 0.7
 WIDER = 2.0  # times the guessed box, in which the model's object is looked for
 BESIDE = 0.3  # part of the largest object's volume, weighted by nearness to the middle, from which on another one is in the box
 MARGIN = 1.3  # times the object that the model finds, for the box around it
@@ -87,10 +85,7 @@ class Shape:
         `to_frame` (4, 4) converts points to these coordinates: p_new = to_frame @ p.
         """
         points = self.box.grid(GRID)[self.occupied > 0.5] @ to_frame[:3, :3].T + to_frame[:3, 3]
-        low, high = points.min(axis=0), points.max(axis=0)
-        matrix = np.diag([*((high - low) / 2 * 1.1 + 1e-9), 1.0])
-        matrix[:3, 3] = (low + high) / 2
-        return Box(matrix)
+        return _box_around(points, 1.1, 1e-9)
 
     def project(self, camera: Camera) -> np.ndarray:
         """Return the largest of the shape's probabilities along each pixel's ray, (H, W) float32."""
@@ -100,20 +95,17 @@ class Shape:
 def carve_object(photos: list[Photo], box: Box, fill: float, backdrop: Backdrop | None, progress) -> Shape | None:
     """Carve the object in a box out of the photos. Return None if nothing is left.
 
-    The first guess is an ellipsoid, whose axes are the fraction `fill` of the box's edges. `backdrop` is the plane that carries the object,
-    or None. The plane's colours are learned here. `progress(done, total)` is called after each round.
+    The first guess is the model's, if photos have `salient`. Otherwise it is an ellipsoid of the fraction `fill` of the box's edges.
+    `backdrop` is the plane that carries the object, or None; its colours are learned here. `progress(done, total)` is called after each
+    round.
     """
     points = box.grid(GRID)
-    pixels = [_pixels(points, photo.camera) for photo in photos]
-    seen = cast(np.ndarray, sum((at >= 0).astype(int) for at in pixels))
-    allowed = seen >= max(2, SEEN * len(photos))
-    if backdrop is not None:
-        allowed &= backdrop.before(points)
+    pixels, seen, enough = _find_pixels(points, photos)
+    allowed = enough if backdrop is None else enough & backdrop.before(points)
     if any(photo.salient is not None for photo in photos):
-        occupied = np.clip(_by_model(photos, pixels, seen), 0, 0.85)
+        occupied = np.clip(_by_model(photos, pixels, seen, enough), 0, 0.85)
     else:
-        centred = np.linalg.norm(np.linalg.solve(box.matrix[:3, :3], (points - box.centre).T), axis=0)
-        occupied = np.clip(1.3 - 1.25 * centred / fill, 0.0, 0.85)
+        occupied = np.clip(1.3 - 1.25 * _off_centre(points, box) / fill, 0.0, 0.85)
     occupied[~allowed] = 0
     pairs = _neighbours(photos, box.centre)
     disagree = DISAGREE if backdrop is None else DISAGREE_PLANE
@@ -160,32 +152,46 @@ def find_box(photos: list[Photo], box: Box) -> Box:
     """
     wide = Box(box.matrix @ np.diag([WIDER, WIDER, WIDER, 1.0]))
     points = wide.grid(GRID)
-    pixels = [_pixels(points, photo.camera) for photo in photos]
-    seen = cast(np.ndarray, sum((at >= 0).astype(int) for at in pixels))
-    likely = _by_model(photos, pixels, seen)
+    likely = _by_model(photos, *_find_pixels(points, photos))
     parts, count = cast(tuple[np.ndarray, int], label(likely.reshape(GRID, GRID, GRID) > 0.5))
     if count == 0:
         return box
-    aside = np.linalg.norm(np.linalg.solve(wide.matrix[:3, :3], (points - wide.centre).T), axis=0)
-    weight = np.bincount(parts.ravel(), np.where(parts.ravel() > 0, np.maximum(1 - aside, 1e-6), 0))
+    weight = np.bincount(parts.ravel(), np.where(parts.ravel() > 0, np.maximum(1 - _off_centre(points, wide), 1e-6), 0))
     found = points[(weight >= BESIDE * weight.max())[parts.ravel()]]
-    low, high = found.min(axis=0), found.max(axis=0)
     voxel = np.abs(points[0] - points[-1]).max() / (GRID - 1)
-    matrix = np.diag([*(MARGIN * (high - low) / 2 + 2 * voxel), 1.0])
+    return _box_around(found, MARGIN, 2 * voxel)
+
+
+def _box_around(points: np.ndarray, scale: float, margin: float) -> Box:
+    """Return the box around points (N, 3), parallel to the axes, scaled by `scale` and wider by `margin` on each side."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    matrix = np.diag([*(scale * (high - low) / 2 + margin), 1.0])
     matrix[:3, 3] = (low + high) / 2
     return Box(matrix)
 
 
-def _by_model(photos: list[Photo], pixels: list[np.ndarray], seen: np.ndarray) -> np.ndarray:
+def _off_centre(points: np.ndarray, box: Box) -> np.ndarray:
+    """Return how far points (N, 3) are from the box's centre: 1 on the ellipsoid that touches its faces."""
+    return np.linalg.norm(np.linalg.solve(box.matrix[:3, :3], (points - box.centre).T), axis=0)
+
+
+def _find_pixels(points: np.ndarray, photos: list[Photo]) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """Return each photo's result of `_pixels`, how many photos see each point (N,), and which points enough of them see (N,)."""
+    pixels = [_pixels(points, photo.camera) for photo in photos]
+    seen = cast(np.ndarray, sum((at >= 0).astype(int) for at in pixels))
+    return pixels, seen, seen >= max(2, SEEN * len(photos))
+
+
+def _by_model(photos: list[Photo], pixels: list[np.ndarray], seen: np.ndarray, enough: np.ndarray) -> np.ndarray:
     """Return the probability (GRID³,) that voxels are in the object, by the model alone.
 
-    `pixels` are the results of `_pixels`, and `seen` (GRID³,) is the number of photos that see a voxel.
+    `pixels`, `seen` and `enough` are the results of `_find_pixels`.
     """
     total = np.zeros(len(seen))
     for photo, at in zip(photos, pixels, strict=True):
         if photo.salient is not None:
             total[at >= 0] += photo.salient.ravel()[at[at >= 0]]
-    mean = np.where(seen >= max(2, SEEN * len(photos)), total / np.maximum(seen, 1), 0)
+    mean = np.where(enough, total / np.maximum(seen, 1), 0)
     # Relative to the largest mean: in some photos the model may take something else.
     return np.clip((mean / max(mean.max(), 1e-6) - 0.6) / 0.4, 0, 1)
 
@@ -379,9 +385,8 @@ def _posterior(
     counts as much as it agrees with the shape: `_trust`.
     """
     evidence = np.clip(_of_colors(photo, prior, plain, colors), -3, 3)
-    if (
-        photo.salient is not None
-    ):  # it misses parts that colours find, and finds parts that have no colours of their own
+    if photo.salient is not None:
+        # The model misses parts that colours find, and finds parts that have no colours of their own.
         evidence += _trust(photo.salient, prior) * np.clip(_of_model(photo.salient), -3, 3)
     odds = np.clip(prior, 0.1, 0.9)
     result = 1 / (1 + np.exp(-(evidence + 0.7 * np.log(odds / (1 - odds)))))
