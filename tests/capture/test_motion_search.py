@@ -11,6 +11,7 @@ from refgs.capture import colmap_steps, motion, read_capture, similar
 from refgs.capture.files import find_photos
 from refgs.capture.images import read_image
 from refgs.capture.motion import find_cameras
+from refgs.capture.poses import OPENGL_TO_OPENCV
 from refgs.errors import InputError
 from tests.makers.captures import look_at, write
 from tests.makers.speckled import about_z, pose_errors, speckled
@@ -127,16 +128,22 @@ def test_photos_that_share_little_are_placed_together(two_sides):
 
 
 def test_a_search_finds_the_same_cameras_again(two_sides, tmp_path):
-    """Check that two searches in the same photos write the same model, byte for byte, placed together and one after the other."""
+    """Check that two searches in the same photos place the same ones, at the same poses, together and one after the other.
+
+    On most machines the two models are equal byte for byte. On some, COLMAP's sums depend on where in memory the numbers are.
+    """
     for photos in (14, 6):
-        models = []
+        found = []
         for turn in range(2):
             folder = tmp_path / f"{photos} {turn}"
             for photo in find_photos(two_sides[0])[:photos]:
                 write(folder / photo.name, read_image(photo)[0])
             find_cameras(folder, lambda *_: None)
-            models.append({file.name: file.read_bytes() for file in (folder / "sparse" / "0").iterdir()})
-        assert models[0] == models[1] and len(models[0]["points3D.bin"]) > 1000
+            found.append(read_capture(folder).views)
+        one, again = ({view.camera.name: view.camera.camera_to_world for view in views} for views in found)
+        assert one.keys() == again.keys()
+        distances, angles = pose_errors(found[1], [one[name] @ OPENGL_TO_OPENCV for name in sorted(one)])
+        assert distances.max() < 0.02 * np.ptp([pose[:3, 3] for pose in one.values()]) and angles.max() < 0.5
 
 
 def test_photos_without_cameras_are_unexplained(tmp_path):
