@@ -11,8 +11,8 @@ from PIL import Image
 
 from refgs import commands
 from refgs.camera import Camera
+from refgs.capture import load_view, read_capture, silhouettes, to_run_frame
 from refgs.capture import masks as making
-from refgs.capture import read_capture, silhouettes, to_run_frame
 from refgs.capture.backdrop import HIDDEN, Backdrop, Plane, find_plane
 from refgs.capture.check import describe
 from refgs.capture.images import read_image
@@ -29,9 +29,11 @@ from tests.makers.captures import (
     edit,
     look_at,
     move_photos,
+    nerf_blender,
     nerfstudio,
     nero,
     ring,
+    tensoir,
     write,
     write_as_phone,
 )
@@ -243,13 +245,23 @@ def test_photos_of_one_name_in_two_folders_get_masks_of_their_own(tmp_path):
     assert [view.mask_path for view in read_capture(folder).views] == list(targets.values())
 
 
-def test_masks_are_not_made_where_they_would_not_be_read(tmp_path):
-    folder = nero(tmp_path / "bell")
+@pytest.mark.parametrize("layout", [nerf_blender, tensoir, nero])
+def test_opaque_photos_of_a_layout_with_masks_of_its_own_get_masks(tmp_path, layout):
+    """Check layouts whose masks are usually the photos' alpha channels or depth maps, in photos that have neither."""
+    folder = layout(tmp_path / "scene")
+    random, truths = np.random.default_rng(0), {}
+    for view in read_capture(folder).views:
+        image, alpha = load_view(view).bytes, load_view(view).alpha
+        write(view.image_path, colored(np.dstack([image, alpha]), random))
+        truths[view.image_path] = alpha > 127
     for depth in folder.glob("*-depth.png"):
         depth.unlink()
-    with pytest.raises(InputError, match="the masks of a nero capture are its depth maps"):
-        make_masks(folder, None, silent)
-    assert not (folder / "masks").exists()
+    assert any("looks for it" in line or "look for it" in line for line in describe(read_capture(folder)))
+    make_masks(folder, None, silent)
+    again = read_capture(folder)
+    assert len({view.mask_path for view in again.views}) == len(truths) and again.masked
+    masks = [read_image(view.mask_path)[0][..., 0] > 127 for view in again.views]
+    assert min(overlap(masks, [truths[view.image_path] for view in again.views])) > 0.85
 
 
 def test_interrupted_call_leaves_the_masks_of_before(tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from refgs.capture.images import LoadedView, load_view
 from refgs.capture.not_used import not_used
 from refgs.capture.priors import FOLDERS, load_depth, load_normals
 from refgs.capture.region import LOOK_OUT, ONE_SIDED
-from refgs.capture.types import Z_UP, Capture, View
+from refgs.capture.types import Capture, View
 from refgs.errors import InputError, one_line
 from refgs.paths import whole
 
@@ -193,13 +193,12 @@ def _priors(capture: Capture) -> list[str]:
 
 def _guessed_box(capture: Capture) -> Box | None:
     """Return the guessed box in which a training would look for the object, or None."""
-    # It makes no masks if a photo has one, if the layout has no place for them, or if the cameras look outwards.
+    # It makes no masks if a photo has one, or if the cameras look outwards.
     if any(view.masked for view in capture.views) or capture.box is not None:
         return None
-    from refgs.capture.masks import guess_box, masks_folder  # imports scipy, as above
+    from refgs.capture.masks import guess_box  # imports scipy, as above
 
     try:
-        masks_folder(capture)
         return guess_box(capture, capture.views)[0]
     except InputError:
         return None
@@ -290,9 +289,6 @@ def _warnings(capture: Capture, statistics: list[_Statistics]) -> list[str]:
     if black or (linear and np.median([s.brightness for s in linear]) > WHITE):
         what = f"EXR photos are almost {'black' if black else 'white'}"
         warnings.append(f"{what}: multiply all of them by the same factor, so that a white surface is about 1")
-    if not capture.masked and capture.bounded and capture.layout in Z_UP:  # others get masks first
-        what = "no masks: the surroundings will be reconstructed with the object"
-        warnings.append(f"{what}; an alpha channel leaves them out")
     if len(capture.train_views) < 20:
         warnings.append(f"{len(capture.train_views)} training views are few: take more, thirty or more are good")
     return warnings

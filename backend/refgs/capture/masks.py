@@ -31,7 +31,7 @@ from refgs.capture.region import LOOK_OUT, WHITE_MASKS, find_region, sample_silh
 from refgs.capture.salience import SalienceModel
 from refgs.capture.silhouettes import Photo, carve_object, cut_out, find_box
 from refgs.capture.triangulate import triangulate
-from refgs.capture.types import Z_UP, Capture, CaptureFiles
+from refgs.capture.types import Capture, CaptureFiles
 from refgs.errors import InputError
 from refgs.events import Report
 from refgs.paths import hash_file, read_text, write_text
@@ -89,7 +89,7 @@ def with_masks(
     folder = files.folder
     judge = _find_judge(model)
     capture = to_run_frame(files, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
-    root = _root(capture)
+    root = capture_root(folder, capture.layout)
     _check_writable(root)
     made = _hashes(root)
     if WHITE_MASKS in capture.warnings:
@@ -214,16 +214,13 @@ def moved_region(wanted: RegionSettings, moved: list[list[float]]) -> RegionSett
 
 
 def masks_folder(capture: Capture) -> Path:
-    """Return the folder for a capture's masks. Raises InputError if the capture's layout stores masks in its photos or depth maps."""
-    return _root(capture) / "masks"
+    """Return the folder for a capture's masks."""
+    return capture_root(capture.folder, capture.layout) / "masks"
 
 
 def count_made(capture: Capture) -> int:
     """Count the views whose masks were made here, and not changed since. The hashes in masks/made.json tell."""
-    try:
-        made = _hashes(_root(capture))
-    except InputError:  # the layout has no folder of masks
-        return 0
+    made = _hashes(capture_root(capture.folder, capture.layout))
     return sum(_is_made(view, made) for view in capture.views) if made else 0
 
 
@@ -245,19 +242,6 @@ def _check_white(files: CaptureFiles, made: set[str]) -> None:
             f"{given[0].parent}: all {len(given)} masks are white (opaque) everywhere, {given[0].name} too. "
             "Delete them, and refgs masks makes new ones."
         )
-
-
-def _root(capture: Capture) -> Path:
-    """Return the folder that holds a capture's folder `masks`. Raises InputError if the layout stores masks in photos or depth maps."""
-    if capture.layout in Z_UP:
-        raise InputError(
-            f"{capture.folder}: the masks of a {capture.layout} capture are its photos' alpha channels. Cut them out there."
-        )
-    if capture.layout == "nero":
-        raise InputError(
-            f"{capture.folder}: the masks of a nero capture are its depth maps, 0-depth.png … Put them there."
-        )
-    return capture_root(capture.folder, capture.layout)
 
 
 def _inner(view: View, root: Path) -> Path:

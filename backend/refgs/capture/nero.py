@@ -2,8 +2,9 @@
 
 The layout is that of `GlossySyntheticDatabase` in NeRO's `dataset/database.py` (Liu et al. 2023). A camera is a pickle of two arrays: world
 to camera (3, 4) with OpenCV's axes, and the intrinsic matrix (3, 3). A depth map stores 0 to 15 units in 16 bits. Depth beyond 14.5 is
-background, smaller depth is the object; this makes the mask. `synthetic_split_128.pkl`, from NeRO's folder `configs`, lists first the
-numbers of the test views, then those of the training views. It may be in the scene's folder or in the folder above.
+background, smaller depth is the object; this makes the mask. A photo without a depth map may have a mask file (see `find_masks`).
+`synthetic_split_128.pkl`, from NeRO's folder `configs`, lists first the numbers of the test views, then those of the training views. It may
+be in the scene's folder or in the folder above.
 """
 
 from pathlib import Path
@@ -14,6 +15,7 @@ from refgs.camera import Camera
 from refgs.capture.files import Files, leave_out_missing, photo_view
 from refgs.capture.images import read_header
 from refgs.capture.lens import check_intrinsics
+from refgs.capture.mask_files import find_masks
 from refgs.capture.pickles import read_pair
 from refgs.capture.poses import world_to_camera
 from refgs.capture.types import View
@@ -30,6 +32,7 @@ def read_nero(folder: Path) -> tuple[list[View], list[str]]:
     files = Files(folder)
     found = [(number, f"{number}.png", files.find(f"{number}.png")) for number in numbers]
     photos, lost = leave_out_missing(folder, found)
+    masks = find_masks(files, [photo for _, photo in photos])
     tested, warnings = _test_numbers(folder, numbers)
     views = []
     for number, photo in photos:
@@ -37,7 +40,7 @@ def read_nero(folder: Path) -> tuple[list[View], list[str]]:
         depth = files.find(f"{number}-depth.png", suffixes=False)
         split = "test" if number in tested else "train"
         camera = _camera(file, str(number), *read_header(photo)[:2])
-        mask, below = (depth, FAR) if depth is not None else (None, None)
+        mask, below = (depth, FAR) if depth is not None else (masks.get(photo), None)
         views.append(photo_view(photo, (camera, None), split, mask, str(file), mask_below=below))
     return views, [*warnings, *lost]
 

@@ -6,7 +6,8 @@ and `dataLoader/tensoIR_relighting_test.py` in its repository). NeRFactor's data
     metadata.json       cam_transform_mat   camera to world with OpenGL's axes: 16 numbers, row by row, with commas between them
                         cam_angle_x         horizontal field of view in radians
                         imw, imh            width and height in pixels
-    rgba.png            the photo, with straight alpha. Some copies of the data set have another name for it: see PHOTOS
+    rgba.png            the photo, with straight alpha. Some copies of the data set have another name for it: see PHOTOS. Its mask may
+                        be a file (see `find_masks`)
     normal.png          n/2 + 1/2, in world coordinates
     albedo.png          linear base colour
     rgba_LIGHT.png      the same view under another light, for each LIGHT in LIGHTS
@@ -17,8 +18,9 @@ folder further up. The views `val_000` … are not used.
 
 from pathlib import Path
 
-from refgs.capture.files import leave_out_missing, photo_view
+from refgs.capture.files import Files, leave_out_missing, photo_view
 from refgs.capture.images import read_header
+from refgs.capture.mask_files import find_masks
 from refgs.capture.transforms import frame_camera
 from refgs.capture.types import Split, View
 from refgs.formats.tensoir import read_metadata
@@ -46,7 +48,8 @@ def read_tensoir(folder: Path) -> tuple[list[View], list[str]]:
     if light_folder(folder) is None:
         what = "Environment_Maps is neither beside the scene's folder nor above it"
         warnings.append(f"{what}: the evaluation does not relight without its panoramas")
-    return [_view(view, photo, split) for (view, split), photo in photos], warnings
+    masks = find_masks(Files(folder), [photo for _, photo in photos])
+    return [_view(view, photo, split, masks.get(photo)) for (view, split), photo in photos], warnings
 
 
 def _folders(folder: Path, split: Split) -> list[tuple[Path, Split]]:
@@ -63,7 +66,7 @@ def _photo(folder: Path) -> Path | None:
     return next((folder / name for name in PHOTOS if (folder / name).is_file()), None)
 
 
-def _view(folder: Path, photo: Path, split: Split) -> View:
+def _view(folder: Path, photo: Path, split: Split, mask: Path | None) -> View:
     file = folder / "metadata.json"
     found = read_metadata(file)
     frame = Frame(
@@ -74,4 +77,4 @@ def _view(folder: Path, photo: Path, split: Split) -> View:
         h=found.imh,
     )
     camera = frame_camera(frame, str(file), read_header(photo)[:2])
-    return photo_view(photo, camera, split, None, str(file))
+    return photo_view(photo, camera, split, mask, str(file))

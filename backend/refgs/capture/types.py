@@ -16,7 +16,7 @@ from refgs.capture.lens import Lens
 from refgs.errors import InputError
 
 Split = Literal["train", "test"]
-Z_UP = ("nerf-blender", "tensoir")  # layouts in whose coordinates +Z is up, and whose masks are the photos' alpha
+Z_UP = ("nerf-blender", "tensoir")  # layouts in whose coordinates +Z is up
 
 
 @dataclass(frozen=True, eq=False)
