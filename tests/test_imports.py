@@ -91,3 +91,9 @@ def test_no_test_imports_another():
     for file in (ROOT / "tests").rglob("*.py"):
         imported = re.findall(r"(?m)^ *(?:from|import) ((?:tests\.|test_|makers|conftest)\S*)", file.read_text("utf-8"))
         assert all(name.startswith("tests.makers") for name in imported), f"{file}: {imported}"
+
+
+def test_every_module_of_tests_has_a_name_of_its_own():
+    """Check what pytest needs where its folders are no packages: of two modules with one name it collects one, and reports an error."""
+    names = [file.name for file in (ROOT / "tests").rglob("test_*.py")]
+    assert sorted(names) == sorted(set(names))
