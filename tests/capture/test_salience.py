@@ -14,8 +14,10 @@ from refgs.capture.salience import MODEL as INSTALLED
 from refgs.capture.salience import SalienceModel
 from refgs.errors import InputError
 from scripts import fetch_model
+from tests.makers import unmasked
+from tests.makers.captures import CENTRE, ball, ring
 from tests.makers.models import REDNESS, write_model
-from tests.makers.unmasked import SIZE, overlap, photograph, read_masks
+from tests.makers.unmasked import COUNT, FOCAL, SIZE, overlap, photograph, read_masks
 
 
 @pytest.mark.parametrize(("size", "last"), [((32, 40), "Identity"), (("h", "w"), "Sigmoid"), ((64, 64), "Exp")])
@@ -73,8 +75,10 @@ class Told:
     def __init__(self, likely):
         self.likely = likely
 
-    def __call__(self, view, size):
-        return cv2.resize(self.likely[int(view.image_path.stem)], size, interpolation=cv2.INTER_AREA)
+    def __call__(self, place):
+        small = place.view.camera.fitted(place.side)
+        likely = self.likely[int(place.view.image_path.stem)]
+        return place.cut(cv2.resize(likely, (small.width, small.height), interpolation=cv2.INTER_AREA))
 
 
 def made_with(folder, monkeypatch, likely):
@@ -99,6 +103,40 @@ def test_parts_that_the_model_misses_are_found_by_their_colours(tmp_path, monkey
         columns = np.flatnonzero(array.any(axis=0))
         array[:, columns[0] : columns[len(columns) // 3]] = False
     assert min(overlap(made_with(tmp_path, monkeypatch, likely), truths)) > 0.9
+
+
+def test_the_model_looks_at_the_part_that_shows_the_object(tmp_path, monkeypatch):
+    """Check the parts of the photos that the model gets: the whole photos, then of each photo a part, with all of the object."""
+    truths = photograph(tmp_path, poses=ring(COUNT, distance=6.0))
+    seen = []
+
+    class Listening(Told):
+        def __call__(self, place):
+            seen.append(place)
+            return super().__call__(place)
+
+    monkeypatch.setattr(masks, "_find_judge", lambda model: Listening([np.float32(truth) for truth in truths]))
+    masks.make_masks(tmp_path, None, lambda event, facts: None)
+    assert min(overlap(read_masks(tmp_path), truths)) > 0.9
+    parts = [place for place in seen if place.part != (0.0, 0.0, 1.0, 1.0)]
+    assert len(seen) - len(parts) == len(truths)
+    assert {place.view.image_path for place in parts} == {place.view.image_path for place in seen}
+    for place in parts:
+        truth = truths[int(place.view.image_path.stem)]
+        shown = place.cut(truth)  # these photos are too small to be reduced
+        assert shown.sum() == truth.sum() and shown.size < 0.9 * truth.size
+
+
+@pytest.mark.parametrize("aimed", [True, False])
+def test_of_two_objects_the_one_that_the_cameras_look_at(tmp_path, monkeypatch, aimed):
+    """Check cameras that look at one of two balls, and cameras that look between them: then both are the object."""
+    aside = CENTRE + np.array([0.0, 1.6, 0.0])
+    monkeypatch.setattr(unmasked, "ASIDE", aside)
+    poses = ring(COUNT, distance=4.0, centre=CENTRE if aimed else (CENTRE + aside) / 2)
+    both = photograph(tmp_path, beside=True, poses=poses)
+    alone = [ball(pose, *SIZE, FOCAL)[..., 3] > 0 for pose in poses]
+    made = made_with(tmp_path, monkeypatch, both)
+    assert np.mean(overlap(made, alone if aimed else both)) > 0.9
 
 
 def test_the_box_is_around_what_the_model_finds(tmp_path):

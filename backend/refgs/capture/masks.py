@@ -12,7 +12,7 @@ import shutil
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -34,11 +34,14 @@ from refgs.capture.triangulate import triangulate
 from refgs.capture.types import Capture, CaptureFiles
 from refgs.errors import InputError
 from refgs.events import Report
+from refgs.geometry.project import project
 from refgs.paths import hash_file, read_text, write_text
 from refgs.settings import RegionSettings
 
-SIDE, FINE = 256, 400  # pixels on the longer side: for carving, for the edges
+SIDE, FINE = 256, 512  # pixels on the longer side of the part that shows the object: for carving, for the edges
 CARVED_BY = 60  # photos at most
+FOUND_BY = 24  # photos at most, in which the object is looked for as a whole, to find the box around it
+AROUND = 0.15  # of the box's size in a photo, on each side of it, that is looked at as well
 MADE = "made.json"
 _HASHES = TypeAdapter(set[str])  # what is in it
 
@@ -119,19 +122,20 @@ def with_masks(
     positions = np.array([view.camera.position for view in views])
     plane = find_plane(points, box.centre, size, up_direction(views), positions)
     backdrop = None if plane is None else Backdrop(plane, box.centre, size)
+    nothing = InputError(
+        f"{folder}: no object was found. Set a box about it (region.size), or draw strokes on some photos."
+    )
+    if judge is not None and not capture.box:
+        some = chosen[:: -(-len(chosen) // FOUND_BY)]
+        box = find_box([_load(_Place.whole(view, SIDE), root, judge) for view in some], box)
     photos = []
     for view in chosen:
-        photos.append(_load(view, root, SIDE, judge))
+        photos.append(_load(_Place.around(box, view, SIDE), root, judge))
         report("progress", {"stage": "reading", "done": len(photos), "total": len(chosen)})
 
     def carving(done: int, total: int) -> None:
         report("progress", {"stage": "carving", "done": done, "total": total})
 
-    nothing = InputError(
-        f"{folder}: no object was found. Set a box about it (region.size), or draw strokes on some photos."
-    )
-    if judge is not None and not capture.box:
-        box = find_box(photos, box)
     shape = carve_object(photos, box, fill, backdrop, carving)
     if shape is None:
         raise nothing
@@ -142,7 +146,8 @@ def with_masks(
     try:
         drawn, found = {}, False
         for view, target in targets.items():
-            mask = _to_photo(view, cut_out(_load(view, root, FINE, judge), shape))
+            place = _Place.around(box, view, FINE)
+            mask = _to_photo(view, place.paste(cut_out(_load(place, root, judge), shape)))
             found |= bool(mask.any())
             path = work / target.relative_to(root)
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -298,36 +303,94 @@ def _find_judge(model: Path | None) -> "_Judge | None":
     return _Judge(SalienceModel(model or salience.MODEL))
 
 
+class _Place(NamedTuple):
+    """Hold which part of a photo is looked at, and how far the photo is reduced.
+
+    `part` has the left, upper, right and lower edge, in parts of the photo's size. `side` is the longer side of the reduced photo, in
+    pixels; the part has the pixels `rows` and `columns` of it.
+    """
+
+    view: View
+    part: tuple[float, float, float, float]
+    side: int
+    rows: slice
+    columns: slice
+
+    @classmethod
+    def of(cls, part: tuple[float, float, float, float], view: View, side: int) -> "_Place":
+        """Return the place of a part that has `side` pixels on its longer side, or fewer if the photo has fewer."""
+        camera = view.camera
+        extent = max((part[2] - part[0]) * camera.width, (part[3] - part[1]) * camera.height)
+        longer = max(camera.width, camera.height)
+        small = camera.fitted(min(longer, round(side * longer / extent)))
+        columns, rows = (
+            slice(int(low * size), max(int(low * size) + 1, int(np.ceil(high * size))))
+            for low, high, size in ((part[0], part[2], small.width), (part[1], part[3], small.height))
+        )
+        return cls(view, part, max(small.width, small.height), rows, columns)
+
+    @classmethod
+    def whole(cls, view: View, side: int) -> "_Place":
+        return cls.of((0.0, 0.0, 1.0, 1.0), view, side)
+
+    @classmethod
+    def around(cls, box: Box, view: View, side: int) -> "_Place":
+        """Return the place of the part that shows a box, with AROUND of its size on each side. A photo that shows no box is taken whole."""
+        at, depth = project(view.camera, box.grid(2))
+        size = np.array([view.camera.width, view.camera.height])
+        low, high = at.min(axis=0) / size, at.max(axis=0) / size
+        low, high = (np.clip(edge, 0, 1) for edge in (low - AROUND * (high - low), high + AROUND * (high - low)))
+        if (depth <= 0).any() or ((high - low) * size < 1).any():
+            return cls.whole(view, side)
+        return cls.of((*low.tolist(), *high.tolist()), view, side)
+
+    def cut(self, pixels: np.ndarray) -> np.ndarray:
+        """Return the part of a reduced photo (H, W, …)."""
+        return pixels[self.rows, self.columns]
+
+    def paste(self, mask: np.ndarray) -> np.ndarray:
+        """Return the mask (H, W) uint8 of the whole reduced photo, from that of the part."""
+        small = self.view.camera.fitted(self.side)
+        whole = np.zeros((small.height, small.width), np.uint8)
+        whole[self.rows, self.columns] = mask
+        return whole
+
+
 class _Judge:
     """Find the object in photos with a segmentation model, and keep the results, because the model may take seconds for a photo."""
 
     def __init__(self, model: SalienceModel):
         self.model = model
-        self.found: dict[Path, np.ndarray] = {}
+        self.found: dict[tuple[Path, tuple], np.ndarray] = {}
 
-    def __call__(self, view: View, size: tuple[int, int]) -> np.ndarray:
-        """Return the object's probability at each pixel, float32 (H, W), of the undistorted photo reduced to `size` (width, height)."""
-        if view.image_path not in self.found:
-            likely = self.model(load_view(view, self.model.side).bytes)
+    def __call__(self, place: _Place) -> np.ndarray:
+        """Return the object's probability at each pixel of a photo's part, float32 (H, W)."""
+        key = place.view.image_path, place.part
+        if key not in self.found:
+            large = _Place.of(place.part, place.view, self.model.side)
+            likely = self.model(np.ascontiguousarray(large.cut(load_view(place.view, large.side).bytes)))
             shrink = min(1.0, FINE / max(likely.shape))
             small = cv2.resize(likely, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-            self.found[view.image_path] = np.rint(255 * small).astype(np.uint8)
-        return cv2.resize(self.found[view.image_path], size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+            self.found[key] = np.rint(255 * small).astype(np.uint8)
+        size = place.columns.stop - place.columns.start, place.rows.stop - place.rows.start
+        return cv2.resize(self.found[key], size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
 
 
-def _load(view: View, root: Path, side: int, judge: _Judge | None) -> Photo:
-    """Load a photo, undistorted and reduced to `side` pixels on its longer side.
+def _load(place: _Place, root: Path, judge: _Judge | None) -> Photo:
+    """Load part of a photo, undistorted and reduced.
 
     Return a Photo. Its `known` comes from the artist's mask or strokes, its `salient` from the segmentation model `judge`, if given.
     """
-    loaded = load_view(view, side)
+    view, loaded = place.view, load_view(place.view, place.side)
     known = np.zeros(loaded.image.shape[:2], np.int8)
     if loaded.alpha is not None:
         known = np.where(loaded.alpha > 127, np.int8(1), np.int8(-1))
     elif (file := _stroke_file(view, root)) is not None:
         known = _read_strokes(file, view, loaded.camera)
-    salient = None if judge is None else judge(view, (loaded.camera.width, loaded.camera.height))
-    return Photo(loaded.bytes, loaded.camera, known, salient)
+    salient = None if judge is None else judge(place)
+    image, known = (np.ascontiguousarray(place.cut(pixels)) for pixels in (loaded.bytes, known))
+    camera = loaded.camera.cropped(place.columns.start, place.rows.start, known.shape[1], known.shape[0])
+    return Photo(image, camera, known, salient)
 
 
 def _read_strokes(file: Path, view: View, camera: Camera) -> np.ndarray:

@@ -47,7 +47,8 @@ class SalienceModel:
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the probability that each pixel shows the object, (H, W) float32, for a photo (H, W, 3) uint8 sRGB."""
         with suppress(OSError):  # `_answer` says why the pipe is closed
-            self._pipe.send(cv2.resize(image, (self._width, self._height), interpolation=cv2.INTER_AREA))
+            way = cv2.INTER_AREA if image.shape[1] > self._width else cv2.INTER_CUBIC
+            self._pipe.send(cv2.resize(image, (self._width, self._height), interpolation=way))
         return cv2.resize(self._answer(), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
 
     def _answer(self) -> Any:

@@ -19,14 +19,14 @@ from typing import cast
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter, label
+from scipy.ndimage import gaussian_filter, label, minimum
 
 from refgs.camera import Camera
 from refgs.capture.backdrop import Backdrop
 from refgs.capture.box import Box
 from refgs.geometry.project import inside, project
 
-GRID = 48  # voxels along an edge of the box
+GRID = 64  # voxels along an edge of the box
 ROUNDS = 6  # of colours and carving; a real head's shape changes by less than 1 % in the last one
 DISAGREE = 0.12  # part of the photos that may contradict a voxel: colours are ambiguous in some
 DISAGREE_PLANE = 0.18  # the same before a plane: an object of its colours looks like it here and there
@@ -36,9 +36,13 @@ SEEN = 0.3  # part of the photos that must show a voxel
 COUNTED = 0.1  # part of the largest object's volume, from which on another one is an object too
 LEARNED = (0, 1, 3)  # rounds in which the plane's texture is learned
 # Overlap of the model's object with the shape, up to which the model does not count, and from which on it counts fully.
-DISTRUSTED, TRUSTED = 0.3, 0.7
+DISTRUSTED, TRUSTED = 0.5, 0.9
+BAND = 0.12  # of a photo's side around the shape, in which they are compared: other objects do not count
+BESIDE_MODEL = 0.5  # of what colours say, which counts where the model counts fully: shadows and mirror images mislead colours more
+HOLE = 0.3  # probability below which a hole that the coarse shape closes is one, as in a mug's handle
 WIDER = 2.0  # times the guessed box, in which the model's object is looked for
-BESIDE = 0.3  # part of the largest object's volume, weighted by nearness to the middle, from which on another one is in the box
+BESIDE = 0.3  # part of the largest object's volume, weighted by nearness to the middle, from which on another one is in the box,
+FARTHER = 0.5  # unless it is farther from the middle by this part of the largest one's radius
 MARGIN = 1.3  # times the object that the model finds, for the box around it
 UNKNOWN = 0.02  # likelihood of a colour that nothing is known of
 LEVELS = (20, 32, 32)  # bins of the histograms, in Lab
@@ -147,19 +151,31 @@ def carve_object(photos: list[Photo], box: Box, fill: float, backdrop: Backdrop 
 def find_box(photos: list[Photo], box: Box) -> Box:
     """Return the box, parallel to the axes, around what the model finds near the middle of `box`; `box` itself if it finds nothing.
 
-    A guessed box may cut the object, or be so large that the object has few voxels. Several objects are taken if they are about as large
-    and as near to the middle. Photos must have `salient`.
+    A guessed box may cut the object, or be so large that the object has few voxels. Of several objects, the one at the middle is taken, and
+    those that are about as large and hardly farther from the middle. Photos must have `salient`.
     """
-    wide = Box(box.matrix @ np.diag([WIDER, WIDER, WIDER, 1.0]))
-    points = wide.grid(GRID)
-    likely = _by_model(photos, *_find_pixels(points, photos))
-    parts, count = cast(tuple[np.ndarray, int], label(likely.reshape(GRID, GRID, GRID) > 0.5))
-    if count == 0:
-        return box
-    weight = np.bincount(parts.ravel(), np.where(parts.ravel() > 0, np.maximum(1 - _off_centre(points, wide), 1e-6), 0))
-    found = points[(weight >= BESIDE * weight.max())[parts.ravel()]]
-    voxel = np.abs(points[0] - points[-1]).max() / (GRID - 1)
-    return _box_around(found, MARGIN, 2 * voxel)
+    middle = box.centre
+    for _ in range(2):  # the second time with voxels of the object's size
+        wide = Box(box.matrix @ np.diag([WIDER, WIDER, WIDER, 1.0]))
+        points = wide.grid(GRID)
+        likely = _by_model(photos, *_find_pixels(points, photos))
+        parts, count = cast(tuple[np.ndarray, int], label(likely.reshape(GRID, GRID, GRID) > 0.5))
+        if count == 0:
+            return box
+        parts = parts.ravel()
+        near = np.maximum(1 - _off_centre(points, wide), 1e-6)
+        weight = np.bincount(parts, np.where(parts > 0, near, 0))
+        # Of each object, the distance from the middle to its nearest point; and a ball of the volume of the one that counts most.
+        gap = minimum(np.linalg.norm(points - middle, axis=1), parts, np.arange(count + 1))
+        first = weight.argmax()
+        radius = (
+            3 / (4 * np.pi) * (parts == first).mean() * np.prod(2 * np.linalg.norm(wide.matrix[:3, :3], axis=0))
+        ) ** (1 / 3)
+        taken = (weight >= BESIDE * weight[first]) & (gap <= gap[first] + FARTHER * radius)
+        taken[0] = False
+        voxel = np.abs(points[0] - points[-1]).max() / (GRID - 1)
+        box = _box_around(points[taken[parts]], MARGIN, 2 * voxel)
+    return box
 
 
 def _box_around(points: np.ndarray, scale: float, margin: float) -> Box:
@@ -217,9 +233,8 @@ def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
     labels[photo.known > 0] = cv2.GC_FGD
     labels[photo.known < 0] = cv2.GC_BGD
     if photo.salient is not None and _trust(photo.salient, prior) > 0.5:  # it knows the edge better than colours do
-        # A hole where model and colours agree on the surroundings is one, though the coarse shape closes it: a mug's handle.
         mask = _only_connected(
-            (likely | (core & (posterior > 0.2))) & around, (solid > 0) & (posterior > 0.1), photo.known
+            (likely | (core & (posterior > 0.2))) & around, (solid > 0) & (posterior > HOLE), photo.known
         )
         return np.where(mask, np.uint8(255), np.uint8(0))
     rows, columns = (np.flatnonzero(around.any(axis=axis)) for axis in (1, 0))
@@ -387,7 +402,9 @@ def _posterior(
     evidence = np.clip(_of_colors(photo, prior, plain, colors), -3, 3)
     if photo.salient is not None:
         # The model misses parts that colours find, and finds parts that have no colours of their own.
-        evidence += _trust(photo.salient, prior) * np.clip(_of_model(photo.salient), -3, 3)
+        trust = _trust(photo.salient, prior)
+        evidence *= 1 + trust * (BESIDE_MODEL - 1)
+        evidence += trust * np.clip(_of_model(photo.salient), -3, 3)
     odds = np.clip(prior, 0.1, 0.9)
     result = 1 / (1 + np.exp(-(evidence + 0.7 * np.log(odds / (1 - odds)))))
     return np.where(photo.known > 0, 0.999, np.where(photo.known < 0, 0.001, result))
@@ -396,10 +413,13 @@ def _posterior(
 def _trust(salient: np.ndarray, prior: np.ndarray) -> float:
     """Return how far a photo's `salient` (H, W) agrees with the shape's projection `prior` (H, W), 0..1.
 
-    Agreement is the overlap (intersection over union): 0 up to DISTRUSTED, as where the model took something else, and 1 from TRUSTED on.
+    Agreement is the overlap (intersection over union) near the shape: 0 up to DISTRUSTED, as where the model took something else, and 1
+    from TRUSTED on.
     """
     inside = prior > 0.5
-    overlap = np.where(inside, salient, 0).sum() / max((inside | (salient > 0.5)).sum(), 1)
+    band = max(3, round(BAND * max(prior.shape))) | 1
+    near = cv2.dilate(inside.astype(np.uint8), np.ones((band, band), np.uint8)) > 0
+    overlap = np.where(inside, salient, 0).sum() / max((inside | (near & (salient > 0.5))).sum(), 1)
     return float(np.clip((overlap - DISTRUSTED) / (TRUSTED - DISTRUSTED), 0, 1))
 
 
