@@ -9,7 +9,9 @@ import hashlib
 import json
 import os
 import shutil
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,7 +42,7 @@ from refgs.settings import RegionSettings
 
 SIDE, FINE = 256, 512  # pixels on the longer side of the part that shows the object: for carving, for the edges
 CARVED_BY = 60  # photos at most
-FOUND_BY = 24  # photos at most, in which the object is looked for as a whole, to find the box around it
+FOUND_BY = 16  # photos at most, in which the object is looked for as a whole, to find the box around it
 AROUND = 0.15  # of the box's size in a photo, on each side of it, that is looked at as well
 MADE = "made.json"
 _HASHES = TypeAdapter(set[str])  # what is in it
@@ -126,11 +128,11 @@ def with_masks(
         f"{folder}: no object was found. Set a box about it (region.size), or draw strokes on some photos."
     )
     if judge is not None and not capture.box:
-        some = chosen[:: -(-len(chosen) // FOUND_BY)]
-        box = find_box([_load(_Place.whole(view, SIDE), root, judge) for view in some], box)
+        some = [chosen[i] for i in np.unique(np.linspace(0, len(chosen) - 1, FOUND_BY).round().astype(int))]
+        box = find_box(list(_load_ahead([_Place.whole(view, SIDE) for view in some], root, judge)), box)
     photos = []
-    for view in chosen:
-        photos.append(_load(_Place.around(box, view, SIDE), root, judge))
+    for photo in _load_ahead([_Place.around(box, view, SIDE) for view in chosen], root, judge):
+        photos.append(photo)
         report("progress", {"stage": "reading", "done": len(photos), "total": len(chosen)})
 
     def carving(done: int, total: int) -> None:
@@ -145,9 +147,9 @@ def with_masks(
     shutil.rmtree(work, ignore_errors=True)
     try:
         drawn, found = {}, False
-        for view, target in targets.items():
-            place = _Place.around(box, view, FINE)
-            mask = _to_photo(view, place.paste(cut_out(_load(place, root, judge), shape)))
+        places = [_Place.around(box, view, FINE) for view in targets]
+        for place, photo, target in zip(places, _load_ahead(places, root, judge), targets.values(), strict=True):
+            mask = _to_photo(place.view, place.paste(cut_out(photo, shape)))
             found |= bool(mask.any())
             path = work / target.relative_to(root)
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -376,6 +378,18 @@ class _Judge:
         return cv2.resize(self.found[key], size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
 
 
+def _load_ahead(places: list[_Place], root: Path, judge: _Judge | None) -> Iterator[Photo]:
+    """Load the parts of photos one after the other (see `_load`), each while the one before it is used."""
+    with ThreadPoolExecutor(1) as thread:
+        ahead: deque[Future[Photo]] = deque()
+        for place in places:
+            ahead.append(thread.submit(_load, place, root, judge))
+            if len(ahead) > 1:
+                yield ahead.popleft().result()
+        for loading in ahead:
+            yield loading.result()
+
+
 def _load(place: _Place, root: Path, judge: _Judge | None) -> Photo:
     """Load part of a photo, undistorted and reduced.
 
@@ -432,10 +446,13 @@ def _to_photo(view: View, mask: np.ndarray) -> np.ndarray:
     # A step at a reduced pixel becomes a smooth edge, cut in its middle and soft over a pixel.
     smooth = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.7)
     if view.lens is not None:
-        # Distorted before it is enlarged: a lens bends little within a reduced pixel, and full size takes seconds.
-        small = view.camera.resized(mask.shape[1], mask.shape[0])
-        maps = _small_lens(view.lens, view.camera, small).maps_back(small)
-        smooth = cv2.remap(smooth, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        # Distorted before it is enlarged, by few positions with others in between: a lens bends little from pixel to pixel, and the
+        # positions of all pixels take seconds.
+        small, (rows, columns) = view.camera.fitted(FINE), mask.shape
+        x, y = _small_lens(view.lens, view.camera, small).maps_back(small)
+        x = cv2.resize((x + 0.5) * (columns / small.width) - 0.5, (columns, rows), interpolation=cv2.INTER_LINEAR)
+        y = cv2.resize((y + 0.5) * (rows / small.height) - 0.5, (columns, rows), interpolation=cv2.INTER_LINEAR)
+        smooth = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     large = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_CUBIC)
     sharpness = max(1.0, max(width, height) / max(mask.shape))
     return np.rint(np.clip((large - 127.5) * sharpness + 127.5, 0, 255)).astype(np.uint8)
