@@ -70,20 +70,20 @@ def test_a_models_process_ends_with_it(tmp_path):
 
 
 class Told:
-    """Judge that says what it is told, in place of a segmentation model: probabilities (H, W) by the photo's number."""
+    """Judge that says what it is told, in part of a segmentation model: probabilities (H, W) by the photo's number."""
 
     def __init__(self, likely):
         self.likely = likely
 
-    def __call__(self, place):
-        small = place.view.camera.fitted(place.side)
-        likely = self.likely[int(place.view.image_path.stem)]
-        return place.cut(cv2.resize(likely, (small.width, small.height), interpolation=cv2.INTER_AREA))
+    def __call__(self, part):
+        small = part.view.camera.fitted(part.side)
+        likely = self.likely[int(part.view.image_path.stem)]
+        return part.cut(cv2.resize(likely, (small.width, small.height), interpolation=cv2.INTER_AREA))
 
 
 def made_with(folder, monkeypatch, likely):
     """Make masks with a model that says `likely` (H, W) of each photo. Returns the masks."""
-    monkeypatch.setattr(masks, "_find_judge", lambda model: Told([np.float32(array) for array in likely]))
+    monkeypatch.setattr(masks, "find_judge", lambda model: Told([np.float32(array) for array in likely]))
     masks.make_masks(folder, None, lambda event, facts: None)
     return read_masks(folder)
 
@@ -111,19 +111,19 @@ def test_the_model_looks_at_the_part_that_shows_the_object(tmp_path, monkeypatch
     seen = []
 
     class Listening(Told):
-        def __call__(self, place):
-            seen.append(place)
-            return super().__call__(place)
+        def __call__(self, part):
+            seen.append(part)
+            return super().__call__(part)
 
-    monkeypatch.setattr(masks, "_find_judge", lambda model: Listening([np.float32(truth) for truth in truths]))
+    monkeypatch.setattr(masks, "find_judge", lambda model: Listening([np.float32(truth) for truth in truths]))
     masks.make_masks(tmp_path, None, lambda event, facts: None)
     assert min(overlap(read_masks(tmp_path), truths)) > 0.9
-    parts = [place for place in seen if place.part != (0.0, 0.0, 1.0, 1.0)]
+    parts = [part for part in seen if part.bounds != (0.0, 0.0, 1.0, 1.0)]
     assert len(seen) - len(parts) == len(truths)
-    assert {place.view.image_path for place in parts} == {place.view.image_path for place in seen}
-    for place in parts:
-        truth = truths[int(place.view.image_path.stem)]
-        shown = place.cut(truth)  # these photos are too small to be reduced
+    assert {part.view.image_path for part in parts} == {part.view.image_path for part in seen}
+    for part in parts:
+        truth = truths[int(part.view.image_path.stem)]
+        shown = part.cut(truth)  # these photos are too small to be reduced
         assert shown.sum() == truth.sum() and shown.size < 0.9 * truth.size
 
 

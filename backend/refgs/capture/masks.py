@@ -9,41 +9,33 @@ import hashlib
 import json
 import os
 import shutil
-from collections import Counter, deque
-from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import cv2
 import numpy as np
 from PIL import Image
 from pydantic import TypeAdapter
 
-from refgs.camera import Camera
-from refgs.capture import View, load_view, read_files, salience, to_run_frame
+from refgs.capture import View, read_files, to_run_frame
 from refgs.capture.backdrop import Backdrop, find_plane
 from refgs.capture.box import Box
 from refgs.capture.cameras import mask_names
 from refgs.capture.colmap import capture_root
-from refgs.capture.images import read_image
-from refgs.capture.lens import Lens
+from refgs.capture.photo_parts import FINE, Part, find_judge, inner_path, load_ahead, stroke_file, to_photo
 from refgs.capture.region import LOOK_OUT, WHITE_MASKS, find_region, sample_silhouettes, up_direction
-from refgs.capture.salience import SalienceModel
-from refgs.capture.silhouettes import Photo, carve_object, cut_out, find_box
+from refgs.capture.silhouettes import carve_object, cut_out, find_box
 from refgs.capture.triangulate import triangulate
 from refgs.capture.types import Capture, CaptureFiles
 from refgs.errors import InputError
 from refgs.events import Report
-from refgs.geometry.project import project
 from refgs.paths import hash_file, read_text, write_text
 from refgs.settings import RegionSettings
 
-SIDE, FINE = 256, 512  # pixels on the longer side of the part that shows the object: for carving, for the edges
+SIDE = 256  # pixels on the longer side of the part that shows the object, for carving
 CARVED_BY = 60  # photos at most
 FOUND_BY = 16  # photos at most, in which the object is looked for as a whole, to find the box around it
-AROUND = 0.15  # of the box's size in a photo, on each side of it, that is looked at as well
 MADE = "made.json"
 _HASHES = TypeAdapter(set[str])  # what is in it
 
@@ -92,7 +84,7 @@ def with_masks(
     Return `files` with the new masks, and the dict that `make_masks` returns.
     """
     folder = files.folder
-    judge = _find_judge(model)
+    judge = find_judge(model)
     capture = to_run_frame(files, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
     root = capture_root(folder, capture.layout)
     _check_writable(root)
@@ -129,9 +121,9 @@ def with_masks(
     )
     if judge is not None and not capture.box:
         some = [chosen[i] for i in np.unique(np.linspace(0, len(chosen) - 1, FOUND_BY).round().astype(int))]
-        box = find_box(list(_load_ahead([_Place.whole(view, SIDE) for view in some], root, judge)), box)
+        box = find_box(list(load_ahead([Part.whole(view, SIDE) for view in some], root, judge)), box)
     photos = []
-    for photo in _load_ahead([_Place.around(box, view, SIDE) for view in chosen], root, judge):
+    for photo in load_ahead([Part.around(box, view, SIDE, root) for view in chosen], root, judge):
         photos.append(photo)
         report("progress", {"stage": "reading", "done": len(photos), "total": len(chosen)})
 
@@ -147,9 +139,9 @@ def with_masks(
     shutil.rmtree(work, ignore_errors=True)
     try:
         drawn, found = {}, False
-        places = [_Place.around(box, view, FINE) for view in targets]
-        for place, photo, target in zip(places, _load_ahead(places, root, judge), targets.values(), strict=True):
-            mask = _to_photo(place.view, place.paste(cut_out(photo, shape)))
+        parts = [Part.around(box, view, FINE, root) for view in targets]
+        for part, photo, target in zip(parts, load_ahead(parts, root, judge), targets.values(), strict=True):
+            mask = to_photo(part.view, part.paste(cut_out(photo, shape)))
             found |= bool(mask.any())
             path = work / target.relative_to(root)
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -251,20 +243,9 @@ def _check_white(files: CaptureFiles, made: set[str]) -> None:
         )
 
 
-def _inner(view: View, root: Path) -> Path:
-    """Return a photo's path relative to `root`, without its first folder, such as `images`.
-
-    The photo's mask has the same path in the folder `masks`, apart from the suffix. Raises InputError if the photo is not in `root`.
-    """
-    if not view.image_path.is_relative_to(root):
-        raise InputError(f"{view.image_path}: the photo is not in the capture's folder {root}. Move it there.")
-    path = view.image_path.relative_to(root)
-    return Path(*path.parts[1:]) if len(path.parts) > 1 else path
-
-
 def _targets(root: Path, views: list[View]) -> dict[View, Path]:
     """Map each photo without a mask to its mask file NAME.png, or to NAME.jpg.png if photos differ only in their suffix."""
-    inner = [_inner(view, root) for view in views]
+    inner = [inner_path(view, root) for view in views]
     twice = Counter(inner)  # as cam1/1.jpg and cam2/1.jpg without a folder images above
     names = [name if twice[name] == 1 else v.image_path.relative_to(root) for name, v in zip(inner, views, strict=True)]
     stems = Counter(name.with_suffix("") for name in names)
@@ -289,173 +270,7 @@ def _hashes(root: Path) -> set[str]:
 def _choose(views: list[View], root: Path) -> list[View]:
     """Choose the photos for carving the object: some evenly spaced photos, and all photos that have the artist's mask or strokes."""
     every = max(1, -(-len(views) // CARVED_BY))
-    return [view for i, view in enumerate(views) if i % every == 0 or view.masked or _stroke_file(view, root)]
-
-
-def _stroke_file(view: View, root: Path) -> Path | None:
-    name = _inner(view, root)
-    files = (root / "strokes" / name.with_suffix(".png"), root / "strokes" / name.with_name(name.name + ".png"))
-    return next((file for file in files if file.is_file()), None)
-
-
-def _find_judge(model: Path | None) -> "_Judge | None":
-    """Load the artist's model, or RefGS's own. Return None if neither is there."""
-    if model is None and not salience.MODEL.is_file():
-        return None
-    return _Judge(SalienceModel(model or salience.MODEL))
-
-
-class _Place(NamedTuple):
-    """Hold which part of a photo is looked at, and how far the photo is reduced.
-
-    `part` has the left, upper, right and lower edge, in parts of the photo's size. `side` is the longer side of the reduced photo, in
-    pixels; the part has the pixels `rows` and `columns` of it.
-    """
-
-    view: View
-    part: tuple[float, float, float, float]
-    side: int
-    rows: slice
-    columns: slice
-
-    @classmethod
-    def of(cls, part: tuple[float, float, float, float], view: View, side: int) -> "_Place":
-        """Return the place of a part that has `side` pixels on its longer side, or fewer if the photo has fewer."""
-        camera = view.camera
-        extent = max((part[2] - part[0]) * camera.width, (part[3] - part[1]) * camera.height)
-        longer = max(camera.width, camera.height)
-        small = camera.fitted(min(longer, round(side * longer / extent)))
-        columns, rows = (
-            slice(int(low * size), max(int(low * size) + 1, int(np.ceil(high * size))))
-            for low, high, size in ((part[0], part[2], small.width), (part[1], part[3], small.height))
-        )
-        return cls(view, part, max(small.width, small.height), rows, columns)
-
-    @classmethod
-    def whole(cls, view: View, side: int) -> "_Place":
-        return cls.of((0.0, 0.0, 1.0, 1.0), view, side)
-
-    @classmethod
-    def around(cls, box: Box, view: View, side: int) -> "_Place":
-        """Return the place of the part that shows a box, with AROUND of its size on each side. A photo that shows no box is taken whole."""
-        at, depth = project(view.camera, box.grid(2))
-        size = np.array([view.camera.width, view.camera.height])
-        low, high = at.min(axis=0) / size, at.max(axis=0) / size
-        low, high = (np.clip(edge, 0, 1) for edge in (low - AROUND * (high - low), high + AROUND * (high - low)))
-        if (depth <= 0).any() or ((high - low) * size < 1).any():
-            return cls.whole(view, side)
-        return cls.of((*low.tolist(), *high.tolist()), view, side)
-
-    def cut(self, pixels: np.ndarray) -> np.ndarray:
-        """Return the part of a reduced photo (H, W, …)."""
-        return pixels[self.rows, self.columns]
-
-    def paste(self, mask: np.ndarray) -> np.ndarray:
-        """Return the mask (H, W) uint8 of the whole reduced photo, from that of the part."""
-        small = self.view.camera.fitted(self.side)
-        whole = np.zeros((small.height, small.width), np.uint8)
-        whole[self.rows, self.columns] = mask
-        return whole
-
-
-class _Judge:
-    """Find the object in photos with a segmentation model, and keep the results, because the model may take seconds for a photo."""
-
-    def __init__(self, model: SalienceModel):
-        self.model = model
-        self.found: dict[tuple[Path, tuple], np.ndarray] = {}
-
-    def __call__(self, place: _Place) -> np.ndarray:
-        """Return the object's probability at each pixel of a photo's part, float32 (H, W)."""
-        key = place.view.image_path, place.part
-        if key not in self.found:
-            large = _Place.of(place.part, place.view, self.model.side)
-            likely = self.model(np.ascontiguousarray(large.cut(load_view(place.view, large.side).bytes)))
-            shrink = min(1.0, FINE / max(likely.shape))
-            small = cv2.resize(likely, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-            self.found[key] = np.rint(255 * small).astype(np.uint8)
-        size = place.columns.stop - place.columns.start, place.rows.stop - place.rows.start
-        return cv2.resize(self.found[key], size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-
-
-def _load_ahead(places: list[_Place], root: Path, judge: _Judge | None) -> Iterator[Photo]:
-    """Load the parts of photos one after the other (see `_load`), each while the one before it is used."""
-    with ThreadPoolExecutor(1) as thread:
-        ahead: deque[Future[Photo]] = deque()
-        for place in places:
-            ahead.append(thread.submit(_load, place, root, judge))
-            if len(ahead) > 1:
-                yield ahead.popleft().result()
-        for loading in ahead:
-            yield loading.result()
-
-
-def _load(place: _Place, root: Path, judge: _Judge | None) -> Photo:
-    """Load part of a photo, undistorted and reduced.
-
-    Return a Photo. Its `known` comes from the artist's mask or strokes, its `salient` from the segmentation model `judge`, if given.
-    """
-    view, loaded = place.view, load_view(place.view, place.side)
-    known = np.zeros(loaded.image.shape[:2], np.int8)
-    if loaded.alpha is not None:
-        known = np.where(loaded.alpha > 127, np.int8(1), np.int8(-1))
-    elif (file := _stroke_file(view, root)) is not None:
-        known = _read_strokes(file, view, loaded.camera)
-    salient = None if judge is None else judge(place)
-    image, known = (np.ascontiguousarray(place.cut(pixels)) for pixels in (loaded.bytes, known))
-    camera = loaded.camera.cropped(place.columns.start, place.rows.start, known.shape[1], known.shape[0])
-    return Photo(image, camera, known, salient)
-
-
-def _read_strokes(file: Path, view: View, camera: Camera) -> np.ndarray:
-    """Read an artist's strokes as int8 (H, W): 1 marks the object, −1 the background, 0 says nothing.
-
-    The strokes are undistorted and resized to `camera`, like the photo. Raises InputError if they lack transparency, or if their aspect
-    ratio is not the photo's.
-    """
-    color, alpha = read_image(file, is_data=True)
-    height, width = color.shape[:2]
-    if abs(width / height * view.camera.height / view.camera.width - 1) > 0.02:
-        raise InputError(
-            f"{file}: the strokes have {width}×{height} pixels, which is not the shape of the photo "
-            f"({view.camera.width}×{view.camera.height}). Draw them on the photo."
-        )
-    if alpha is None:
-        raise InputError(
-            f"{file}: the strokes have no transparency. Save them with it: transparent where nothing is said."
-        )
-    sides = [((color.mean(axis=2) > 127) == white) & (alpha > 127) for white in (True, False)]
-    drawn = []
-    for side in sides:
-        part = cv2.resize(side.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        if view.lens is not None:
-            part = cv2.remap(part, *_small_lens(view.lens, view.camera, camera).maps(camera), cv2.INTER_LINEAR)
-        drawn.append(part)
-    ours, theirs = drawn
-    return np.where(np.maximum(ours, theirs) < 0.3, 0, np.where(ours >= theirs, 1, -1)).astype(np.int8)
-
-
-def _small_lens(lens: Lens, camera: Camera, small: Camera) -> Lens:
-    """Return the lens of a photo that was reduced from the size of `camera` to that of `small`."""
-    return lens.resized(small.width / camera.width, small.height / camera.height)
-
-
-def _to_photo(view: View, mask: np.ndarray) -> np.ndarray:
-    """Convert a mask of the undistorted, reduced photo to a mask (H, W) uint8 of the upright, distorted photo at full size."""
-    width, height = view.camera.width, view.camera.height
-    # A step at a reduced pixel becomes a smooth edge, cut in its middle and soft over a pixel.
-    smooth = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.7)
-    if view.lens is not None:
-        # Distorted before it is enlarged, by few positions with others in between: a lens bends little from pixel to pixel, and the
-        # positions of all pixels take seconds.
-        small, (rows, columns) = view.camera.fitted(FINE), mask.shape
-        x, y = _small_lens(view.lens, view.camera, small).maps_back(small)
-        x = cv2.resize((x + 0.5) * (columns / small.width) - 0.5, (columns, rows), interpolation=cv2.INTER_LINEAR)
-        y = cv2.resize((y + 0.5) * (rows / small.height) - 0.5, (columns, rows), interpolation=cv2.INTER_LINEAR)
-        smooth = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    large = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_CUBIC)
-    sharpness = max(1.0, max(width, height) / max(mask.shape))
-    return np.rint(np.clip((large - 127.5) * sharpness + 127.5, 0, 255)).astype(np.uint8)
+    return [view for i, view in enumerate(views) if i % every == 0 or view.masked or stroke_file(view, root)]
 
 
 def _put(files: dict[Path, Path], root: Path, before: set[str]) -> None:
