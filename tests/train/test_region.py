@@ -20,7 +20,7 @@ from refgs.train.keep.live_view import write_preview
 from refgs.train.start import start_parameters
 from tests.makers.training import SMALL, trainer
 
-CHANGES = [*SMALL, "surfels.hull=48", "train.iterations=150", "mesh.resolution=48"]
+CHANGES = [*SMALL, "surfels.hull=48", "train.iterations=150", "mesh.resolution=48", "image.masks=off"]
 RIGHT = ["region.centre=[0.62, 0.0, 0.0]", "region.size=[1.2, 1.2, 1.2]"]
 
 
