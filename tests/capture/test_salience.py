@@ -70,7 +70,7 @@ def test_a_models_process_ends_with_it(tmp_path):
 
 
 class Told:
-    """Judge that says what it is told, in part of a segmentation model: probabilities (H, W) by the photo's number."""
+    """Judge that says what it is told, in place of a segmentation model: probabilities (H, W) by the photo's number."""
 
     def __init__(self, likely):
         self.likely = likely

@@ -116,9 +116,6 @@ def with_masks(
     positions = np.array([view.camera.position for view in views])
     plane = find_plane(points, box.centre, size, up_direction(views), positions)
     backdrop = None if plane is None else Backdrop(plane, box.centre, size)
-    nothing = InputError(
-        f"{folder}: no object was found. Set a box about it (region.size), or draw strokes on some photos."
-    )
     if judge is not None and not capture.box:
         some = [chosen[i] for i in np.unique(np.linspace(0, len(chosen) - 1, FOUND_BY).round().astype(int))]
         box = find_box(list(load_ahead([Part.whole(view, SIDE) for view in some], root, judge)), box)
@@ -130,6 +127,9 @@ def with_masks(
     def carving(done: int, total: int) -> None:
         report("progress", {"stage": "carving", "done": done, "total": total})
 
+    nothing = InputError(
+        f"{folder}: no object was found. Set a box about it (region.size), or draw strokes on some photos."
+    )
     shape = carve_object(photos, box, fill, backdrop, carving)
     if shape is None:
         raise nothing
