@@ -32,6 +32,7 @@ FLOORS = (
         "paths",
         "process",
         "settings",
+        "spread",
     ),
     ("formats",),
     ("kernels",),

@@ -290,7 +290,7 @@ def status_words(job: jobs.Job) -> str:
             return count_words(done - failed, total, failed)
         if stage == "frames":
             return "{done} frames read, {kept} kept, {blurred} blurred".format(**job.progress)
-        if stage in ("points", "reading", "carving", "edges"):
+        if stage in ("points", "looking", "reading", "carving", "edges"):
             return f"making masks: {stage}"
         return {"colours": "learning colours", "baking": "baking textures"}.get(stage, f"finding cameras: {stage}")
     return f"{_duration(job.progress['seconds_left'])} left"

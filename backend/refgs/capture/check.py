@@ -19,6 +19,7 @@ from refgs.capture.region import LOOK_OUT, ONE_SIDED
 from refgs.capture.types import Capture, View
 from refgs.errors import InputError, one_line
 from refgs.paths import whole
+from refgs.spread import spread
 
 THUMBNAILS, THUMBNAIL_SIDE = 12, 128  # maximum number; pixels
 BLURRED = 0.4  # part of the capture's median sharpness. Sharp photos reach at least 0.6; blurred by 2 pixels of 512, at most 0.2
@@ -47,7 +48,9 @@ def check(capture: Capture, out: Path) -> dict[str, Any]:
     return {
         "capture": str(capture.folder.resolve()),
         "cameras": str((out / "cameras.json").resolve()),
-        "thumbnails": [str(_thumbnail(out, number).resolve()) for number in _thumbnail_indices(len(capture.views))],
+        "thumbnails": [
+            str(_thumbnail(out, number).resolve()) for number in spread(range(len(capture.views)), THUMBNAILS)
+        ],
         "centre": capture.centre.tolist(),
         "radius": float(capture.radius),
         "lines": lines,
@@ -117,11 +120,6 @@ def _sharpness(image: np.ndarray, inside: np.ndarray) -> float:
     return float((cv2.Laplacian(grey, cv2.CV_32F)[inside] ** 2).sum()) / gradient if gradient > 0 else 0.0
 
 
-def _thumbnail_indices(count: int) -> list[int]:
-    """Return up to 12 evenly spaced indices of `count` views: these views get thumbnails."""
-    return sorted({round(number) for number in np.linspace(0, count - 1, THUMBNAILS)})
-
-
 def _thumbnail(folder: Path, number: int) -> Path:
     return folder / f"{number:04d}.png"
 
@@ -136,7 +134,7 @@ def _write_thumbnail(file: Path, loaded: LoadedView) -> None:
 
 def _decode_all(capture: Capture, thumbnails: Path | None) -> list[_Statistics]:
     statistics, broken = [], []
-    shown = _thumbnail_indices(len(capture.views)) if thumbnails else []
+    shown = spread(range(len(capture.views)), THUMBNAILS) if thumbnails else []
     for number, view in enumerate(capture.views):
         try:
             loaded = load_view(view, 512)

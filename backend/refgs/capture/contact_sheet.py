@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from refgs.capture.images import read_image
+from refgs.spread import spread
 
 SIDE = 144  # pixels of a thumbnail's longer side
 GAP, TEXT = 8, 12  # pixels between thumbnails; height of a line of text
@@ -17,7 +17,7 @@ def write_contact_sheet(groups: list[list[Path]], file: Path) -> None:
 
     Raises InputError if a photo cannot be read.
     """
-    shown = [[group[i] for i in np.unique(np.linspace(0, len(group) - 1, ROW).round().astype(int))] for group in groups]
+    shown = [spread(group, ROW) for group in groups]
     across, down = SIDE + GAP, TEXT + GAP + SIDE + TEXT + 2 * GAP
     sheet = Image.new("RGB", (GAP + across * max(map(len, shown)), GAP + down * len(groups)), (32, 32, 32))
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(TEXT)

@@ -25,13 +25,14 @@ from refgs.capture.cameras import mask_names
 from refgs.capture.colmap import capture_root
 from refgs.capture.photo_parts import FINE, Part, find_judge, inner_path, load_ahead, stroke_file, to_photo
 from refgs.capture.region import LOOK_OUT, WHITE_MASKS, find_region, sample_silhouettes, up_direction
-from refgs.capture.silhouettes import carve_object, cut_out, find_box
+from refgs.capture.silhouettes import Photo, carve_object, cut_out, find_box
 from refgs.capture.triangulate import triangulate
 from refgs.capture.types import Capture, CaptureFiles
 from refgs.errors import InputError
 from refgs.events import Report
 from refgs.paths import hash_file, read_text, write_text
 from refgs.settings import RegionSettings
+from refgs.spread import spread
 
 SIDE = 256  # pixels on the longer side of the part that shows the object, for carving
 CARVED_BY = 60  # photos at most
@@ -103,6 +104,13 @@ def with_masks(
     def reading(done: int, total: int) -> None:
         report("progress", {"stage": "points", "done": done, "total": total})
 
+    def load(parts: list[Part], stage: str) -> list[Photo]:
+        photos = []
+        for photo in load_ahead(parts, root, judge):
+            photos.append(photo)
+            report("progress", {"stage": stage, "done": len(photos), "total": len(parts)})
+        return photos
+
     if capture.box:
         box, fill, size = capture.box, 0.9, capture.box.radius / 3**0.5
     else:
@@ -117,12 +125,8 @@ def with_masks(
     plane = find_plane(points, box.centre, size, up_direction(views), positions)
     backdrop = None if plane is None else Backdrop(plane, box.centre, size)
     if judge is not None and not capture.box:
-        some = [chosen[i] for i in np.unique(np.linspace(0, len(chosen) - 1, FOUND_BY).round().astype(int))]
-        box = find_box(list(load_ahead([Part.whole(view, SIDE) for view in some], root, judge)), box)
-    photos = []
-    for photo in load_ahead([Part.around(box, view, SIDE, root) for view in chosen], root, judge):
-        photos.append(photo)
-        report("progress", {"stage": "reading", "done": len(photos), "total": len(chosen)})
+        box = find_box(load([Part.whole(view, SIDE) for view in spread(chosen, FOUND_BY)], "looking"), box)
+    photos = load([Part.around(box, view, SIDE, root) for view in chosen], "reading")
 
     def carving(done: int, total: int) -> None:
         report("progress", {"stage": "carving", "done": done, "total": total})

@@ -8,6 +8,7 @@ import numpy as np
 from refgs.camera import Camera
 from refgs.capture.colmap_steps import epipolar_distance
 from refgs.capture.images import LoadedView
+from refgs.spread import spread
 
 SOME = 24  # photos that are matched
 SIDE = 800  # pixels of the longer side that they are reduced to; SIFT takes 180 bytes for each of a photo's pixels
@@ -43,7 +44,7 @@ def match_neighbours(views: list[LoadedView]) -> list[Matches]:
         return []
     positions = np.stack([view.camera.position for view in views])
     pairs = set()
-    for first in np.unique(np.linspace(0, len(views) - 1, SOME).round().astype(int)).tolist():
+    for first in spread(range(len(views)), SOME):
         distance = np.linalg.norm(positions - positions[first], axis=1)
         distance[first] = np.inf
         second = int(distance.argmin())

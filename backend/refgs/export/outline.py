@@ -16,6 +16,7 @@ from refgs.camera import Camera
 from refgs.formats.mesh import Mesh, SmoothMesh
 from refgs.geometry.mesh import smooth_normals
 from refgs.render.renderer import Rendering
+from refgs.spread import spread
 
 VIEWS = 24  # cameras at most, evenly chosen
 UPSAMPLING = 4  # of alpha, each way, so that outlines have subpixel precision
@@ -37,8 +38,7 @@ def fit_to_outlines(
     `voxel` is the size in world units of the voxels that the mesh was made from. No vertex moves by more than LARGEST_MOVE voxels. The mesh
     is returned unchanged if the renderings show no background around the object, or if most gaps are larger than LARGEST_MOVE + 1 voxels.
     """
-    chosen = [cameras[i] for i in np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).astype(int)]
-    views = [(camera, _signed_distance(render(camera).alpha.numpy())) for camera in chosen]
+    views = [(camera, _signed_distance(render(camera).alpha.numpy())) for camera in spread(cameras, VIEWS)]
     views = [(camera, distance) for camera, distance in views if (distance < 0).any() and (distance > 0).any()]
     smooth, most = _smoother(mesh), LARGEST_MOVE * voxel
     step = np.zeros(len(mesh.vertices))

@@ -22,7 +22,6 @@ from pathlib import Path
 
 import cv2
 import jinja2
-import numpy as np
 
 from refgs import __version__
 from refgs.errors import InputError, one_line
@@ -37,6 +36,7 @@ from refgs.report.charts import PARTS, error_chart, parts_chart
 from refgs.report.curves import QUANTITIES, Curve, as_csv, curve, knee, levels, time_to
 from refgs.report.figures import DETAILS, HEADLINE, RELIT, Quantity, duration, flatten, is_number, relit_pair
 from refgs.report.labels import labels
+from refgs.spread import spread
 
 PASSES = {
     "photo": "photo",
@@ -216,9 +216,7 @@ def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[
     """Return {name: {kind: data URL}} of folder/KIND/NAME.png, for at most `most` complete names."""
     count = Counter(path.stem for kind in kinds for path in folder.glob(f"{kind}/*.png"))
     names = sorted(name for name in count if count[name] == max(count.values()))
-    if len(names) > most:
-        names = [names[i] for i in np.linspace(0, len(names) - 1, most).round().astype(int)]
-    found = {name: {kind: _embed(folder / kind / f"{name}.png") for kind in kinds} for name in names}
+    found = {name: {kind: _embed(folder / kind / f"{name}.png") for kind in kinds} for name in spread(names, most)}
     return {name: images for name, images in found.items() if any(images.values())}
 
 

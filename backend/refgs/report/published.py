@@ -16,6 +16,7 @@ from refgs.compare.published import StanfordORBTruth, TensoIRTruth
 from refgs.compare.truth import GroundTruth
 from refgs.render.renderer import Rendering
 from refgs.run import Run
+from refgs.spread import spread
 
 RATIO_VIEWS = 20  # by which TensoIR corrects base colour, evenly chosen; pictures of these are written
 
@@ -49,8 +50,7 @@ def _tensoir(
 ) -> dict[str, Any]:
     """Measure as TensoIR does, scaling base colours by a `ratio` for each channel."""
     found: dict[str, Any] = {}
-    places = np.linspace(0, len(cameras) - 1, min(len(cameras), RATIO_VIEWS)).round().astype(int)
-    chosen = [cameras[i] for i in places]
+    chosen = spread(cameras, RATIO_VIEWS)
     if "albedo" in truth.passes:
         pairs = []
         for camera in chosen:

@@ -18,10 +18,11 @@ from refgs.render.rasterize import rasterize
 from refgs.render.rendering import COVERED, Rendering
 from refgs.render.sums import blended_shares
 from refgs.render.volume import discs
+from refgs.spread import spread
 from refgs.train.learn.coarse import cost
 from refgs.train.learn.exposures import exposure
 from refgs.train.learn.losses import objective
-from refgs.train.state import RenderInputs, State, spread
+from refgs.train.state import RenderInputs, State
 
 VIEWS = 8  # views that are looked at, at most
 SEVERAL = 12  # views, at most, where a surfel must be seen from several sides
@@ -76,7 +77,7 @@ def lost(views: Iterable[tuple[Tensor, Tensor, Tensor]]) -> Lost:
 
 def spread_views(state: State, most: int = VIEWS) -> list[int]:
     """Return the indices of at most `most` training views, evenly spaced."""
-    return [*spread(range(len(state.photos)), most)]
+    return spread(range(len(state.photos)), most)
 
 
 @torch.no_grad()

@@ -1,6 +1,5 @@
 """Hold the state of a training: the capture, the parameters that it learns, and the decisions that it has made."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -25,11 +24,6 @@ from refgs.train.photo import Crop, Photo
 from refgs.train.plan import Plan
 
 P = TypeVar("P")
-
-
-def spread(items: Sequence, most: int) -> Sequence:
-    """Return at most `most` items, every n-th from the first one on."""
-    return items[:: max(1, len(items) // most)][:most]
 
 
 class RenderInputs(NamedTuple):

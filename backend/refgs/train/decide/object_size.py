@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from refgs.settings import SurfelSettings
+from refgs.spread import spread
 from refgs.train.photo import crop_of
-from refgs.train.state import State, spread
+from refgs.train.state import State
 
 SIZE_VIEWS = 24  # views that are measured, at most
 LEAST_GROWTH = 2  # even the smallest object may get this many times the surfels of the start

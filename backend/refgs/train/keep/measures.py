@@ -15,7 +15,8 @@ from refgs.errors import InputError
 from refgs.model.environment import Environment
 from refgs.render.renderer import Rendering, render
 from refgs.run import light_of
-from refgs.train.state import State, spread
+from refgs.spread import spread
+from refgs.train.state import State
 
 MEASURED_VIEWS = 4  # held-out views that are measured, at most
 SLOW_VIEWS = 2  # of these, views for slow measures: relighting, and FLIP, which takes as long as ten renderings

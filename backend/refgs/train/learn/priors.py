@@ -19,9 +19,10 @@ from refgs.camera import Camera
 from refgs.capture import load_depth, load_normals
 from refgs.capture.poses import split_similarity
 from refgs.render.rendering import SOLID, Rendering
+from refgs.spread import spread
 from refgs.train.part import Part
 from refgs.train.photo import Photo
-from refgs.train.state import State, spread
+from refgs.train.state import State
 from refgs.train.timeline import Step
 
 FADED = 0.6  # part of the training after which priors have no weight
