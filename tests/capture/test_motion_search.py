@@ -165,6 +165,30 @@ def unexplained(folder: Path) -> tuple[float, float]:
     return with_all, colmap_steps.unexplained_part(model, database)
 
 
+def test_a_camera_that_contradicts_its_photo_is_removed(tmp_path):
+    """Check that a camera that does not look where its photo does is removed from a model, and no other camera is."""
+    photograph(tmp_path, orbit(np.arange(0, 50, 10)))
+    assert in_child(supported, tmp_path) == [{0, 1, 2, 3, 4}, {0, 1, 3, 4}]
+
+
+def supported(folder: Path) -> list[set[int]]:
+    """Return the photos whose cameras stay: of the model as it is found, and once the camera in the middle is tilted by 20°."""
+    import pycolmap
+
+    photos, database = find_photos(folder), folder / "all.db"
+    colmap_steps.extract_features(photos, [], database, lambda *_: None)
+    colmap_steps.match_features(database, lambda *_: None)
+    model = colmap_steps.map_one_by_one(photos, database, lambda *_: None)[0]
+    middle = next(image for image in model.images.values() if int(image.name) == len(photos) // 2)
+    tilt = pycolmap.Rigid3d(pycolmap.Rotation3d(np.radians([20.0, 0, 0])), np.zeros(3))
+    found = []
+    for change in (pycolmap.Rigid3d(), tilt):
+        model.frame(middle.frame_id).rig_from_world = change * middle.cam_from_world()
+        colmap_steps.remove_unsupported(model, database)
+        found.append({int(model.image(number).name) for number in model.reg_image_ids()})
+    return found
+
+
 def in_child(work, folder: Path):
     """Return `work(folder)`, called in a process of its own, because COLMAP's OpenMP conflicts with torch's on some systems."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:

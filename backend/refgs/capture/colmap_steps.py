@@ -29,6 +29,7 @@ ONE_THREAD = 1
 TIED = 3  # points that a photo must share with others; COLMAP asks for 30 where it places one photo after the other
 LINKED = 30  # matches between two photos of a group; COLMAP asks for as many where it places one photo after the other
 MATCH_TOLERANCE = 8.0  # pixels from its epipolar line, above which a match contradicts the cameras; COLMAP allows 4
+SUPPORTED = 0.5  # part of a photo's matches with other placed photos, below which its camera is taken to be wrong
 FEW_CAMERA_MODEL = "SIMPLE_RADIAL"  # of what tells little about the lens: see the next two
 WELL_SEEN = 10  # photos of one lens and size. 23 of a statue, cropped to 7 sizes, are all placed; with RADIAL, 3 are
 INSIDE_CAMERA_MODEL = FEW_CAMERA_MODEL  # an object fills little of the photos: with RADIAL 5 of 66 of a head are placed
@@ -213,9 +214,8 @@ def map_one_by_one(photos: list[Path], database: Path, progress: Callable) -> li
 
     written = database.with_name(database.name + ".models")  # COLMAP writes all models here, the small ones too
     written.mkdir(exist_ok=True)
-    return _largest_first(
-        pycolmap.incremental_mapping(database, photos[0].parent, written, options, "", first, another)
-    )
+    models = pycolmap.incremental_mapping(database, photos[0].parent, written, options, "", first, another)
+    return _largest_first(models, database)
 
 
 def map_at_once(photos: list[Path], database: Path) -> list[Any]:
@@ -234,7 +234,7 @@ def map_at_once(photos: list[Path], database: Path) -> list[Any]:
         tied = _tied(model)
         for number in set(model.reg_image_ids()) - tied:
             model.deregister_frame(model.image(number).frame_id)
-    return _largest_first({number: model for number, model in models.items() if model.num_reg_images()})
+    return _largest_first(models, database)
 
 
 def _tied(model: Any) -> set[int]:
@@ -258,8 +258,12 @@ def _tied(model: Any) -> set[int]:
     return tied
 
 
-def _largest_first(models: dict[int, Any]) -> list[Any]:
-    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+def _largest_first(models: dict[int, Any], database: Path) -> list[Any]:
+    """Remove unsupported cameras from all models, and return those that have cameras left, the one with most photos first."""
+    for model in models.values():
+        remove_unsupported(model, database)
+    placed = (model for model in models.values() if model.num_reg_images())
+    return sorted(placed, key=lambda model: model.num_reg_images(), reverse=True)
 
 
 def epipolar_distance(ours: np.ndarray, theirs: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -279,9 +283,19 @@ def epipolar_distance(ours: np.ndarray, theirs: np.ndarray, pose: np.ndarray) ->
 def unexplained_part(model: Any, database: Path) -> float:
     """Return the fraction of feature matches that the cameras of a model (a pycolmap.Reconstruction) do not explain.
 
-    A match is explained if both its photos have cameras, and its points are at most MATCH_TOLERANCE pixels from their epipolar lines.
     Matches of photos without cameras count as unexplained. This detects an object that turns, as on a turntable, while the room stands
     still. COLMAP may then find cameras only for photos whose matches follow the object, and none for photos whose matches follow the room.
+    """
+    pairs = _explained_matches(model, database)
+    explained, total = sum(pair[2] for pair in pairs), sum(pair[3] for pair in pairs)
+    return 1 - explained / total if total else 0.0
+
+
+def _explained_matches(model: Any, database: Path) -> list[tuple[int, int, int, int]]:
+    """Count the feature matches of each pair of photos that the cameras of a model (a pycolmap.Reconstruction) explain.
+
+    A match is explained if both its photos have cameras, and its points are at most MATCH_TOLERANCE pixels from their epipolar lines.
+    Returns a list of (image ID, image ID, explained matches, all matches).
     """
     import pycolmap
 
@@ -290,21 +304,36 @@ def unexplained_part(model: Any, database: Path) -> float:
         places = {number: known.read_keypoints(number)[:, :2].astype(float) for number in placed}
         verified = list(zip(*known.read_two_view_geometries(), strict=True))
     rays = {number: model.image(number).camera.cam_from_img(places[number]) for number in placed}
-    wrong, total = 0, 0
+    pairs = []
     for pair, geometry in verified:
-        (a, b), matches = pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches
-        total += len(matches)
-        if not {a, b} <= placed:
-            wrong += len(matches)
-        else:
+        (a, b), matches, explained = pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches, 0
+        if {a, b} <= placed:
             ours, theirs = model.image(a), model.image(b)
             pose = (theirs.cam_from_world() * ours.cam_from_world().inverse()).matrix()
-            far = (
-                epipolar_distance(rays[a][matches[:, 0]], rays[b][matches[:, 1]], pose)
-                * ours.camera.mean_focal_length()
-            )
-            wrong += int((far > MATCH_TOLERANCE).sum())
-    return wrong / max(total, 1)
+            far = epipolar_distance(rays[a][matches[:, 0]], rays[b][matches[:, 1]], pose)
+            explained = int((far * ours.camera.mean_focal_length() <= MATCH_TOLERANCE).sum())
+        pairs.append((a, b, explained, len(matches)))
+    return pairs
+
+
+def remove_unsupported(model: Any, database: Path) -> None:
+    """Remove cameras from a model (a pycolmap.Reconstruction) that contradict most of their photos' matches with other placed photos.
+
+    A camera stays if it explains more than SUPPORTED of these matches. The worst camera goes first, and its matches no longer count
+    against its neighbours.
+    """
+    pairs = _explained_matches(model, database)
+    while placed := set(model.reg_image_ids()):
+        explained, total = Counter(), Counter()
+        for a, b, right, count in pairs:
+            if {a, b} <= placed:
+                for number in (a, b):
+                    explained[number] += right
+                    total[number] += count
+        worst = min(placed, key=lambda number: explained[number] / max(total[number], 1))
+        if explained[worst] > SUPPORTED * total[worst]:
+            break
+        model.deregister_frame(model.image(worst).frame_id)
 
 
 def linked_groups(database: Path) -> list[list[int]]:

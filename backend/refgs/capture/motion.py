@@ -13,6 +13,9 @@ Such cameras leave many feature matches unexplained. If there are masks, the cam
 new cameras are kept if they explain more matches. Inside the masks, weaker features are used, too, because a shiny object has few strong
 ones. If many matches remain unexplained, the user gets a warning.
 
+Cameras that contradict most of their photo's matches are removed from every result (`remove_unsupported`), so that no result wins by
+wrong cameras.
+
 If fewer than PLACED of the photos get a camera, the same is tried with learned features (`learned.py`), where these are installed. The
 better of the two results is used.
 """
