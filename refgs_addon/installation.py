@@ -198,7 +198,8 @@ def _install(home: Path, uv: Path, trainer: Path) -> None:
     install = ["pip", "install", "--no-build", "--python", str(python(home))]
     if trainer.with_name("lock.txt").is_file():
         lock = _choose_lock(program, variables, home, trainer.parent)
-        _run_uv(program, variables, home, *install, "--require-hashes", "--requirements", str(lock))
+        # --no-deps: the lock is complete, and leaves out packages that others only declare (see pyproject.toml).
+        _run_uv(program, variables, home, *install, "--no-deps", "--require-hashes", "--requirements", str(lock))
         _run_uv(program, variables, home, *install, "--no-deps", str(trainer))
         said = _describe_origin(_resolve(program, variables, home, lock))
     else:

@@ -63,12 +63,12 @@ def build_trainer(source: Path, wheels: Path) -> None:
 
 
 def write_locks(project: Path, folder: Path) -> None:
-    """Lock the packages that a `project`, a pyproject.toml with the extra `farm`, needs now. Write the locks into a folder.
+    """Lock the packages that a `project`, a pyproject.toml with the extras `farm` and `learned`, needs now. Write the locks into a folder.
 
     `lock.txt` is for torch of the package index, `lock-BUILD.txt` for a build of torch that has an index of its own. A build that does not
     exist, or whose index cannot be reached, gets none: machines that it is for then take torch from the package index.
     """
-    how = ["-m", "uv", "pip", "compile", project, "--extra", "farm"]
+    how = ["-m", "uv", "pip", "compile", project, "--project", project.parent, "--extra", "farm", "--extra", "learned"]
     how += ["--universal", "--python-version", "3.11"]
     how += ["--generate-hashes", "--only-binary", ":all:", "--no-header", "--no-annotate", "--quiet"]
     run(*how, "--output-file", folder / "lock.txt")

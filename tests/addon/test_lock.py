@@ -36,10 +36,14 @@ def write_wheel(folder, name, version, code, requires=()):
 
 @pytest.fixture
 def release(tmp_path, monkeypatch):
-    """Make a release whose trainer needs two packages, and lock them. Return the folder of its wheels, and the index."""
+    """Make a release whose trainer needs three packages, and lock them. Return the folder of its wheels, and the index.
+
+    One of the three declares another, which pyproject.toml leaves out, and which the index does not have.
+    """
     index, wheels = tmp_path / "simple", tmp_path / "wheels"
     write_wheel(index / "tiny", "tiny", "1.0", "a = 1\n")
     write_wheel(index / "torch", "torch", "2.14.0", "a = 1\n", ["tiny"])
+    write_wheel(index / "matcher", "matcher", "1.0", "a = 1\n", ["left-out"])
     for name, value in {"UV_DEFAULT_INDEX": index.as_uri(), "UV_PYTHON_PREFERENCE": "only-system"}.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("UV_TORCH_BACKEND", "")
@@ -48,10 +52,12 @@ def release(tmp_path, monkeypatch):
     program = "uv.exe" if sys.platform == "win32" else "uv"
     with zipfile.ZipFile(wheels / "uv-1.0-py3-none-any.whl", "w") as archive:
         archive.write(uv.find_uv_bin(), f"uv-1.0.data/scripts/{program}")
-    project = tmp_path / "pyproject.toml"
+    project = tmp_path / "clone" / "pyproject.toml"
+    project.parent.mkdir()
     project.write_text(
         '[project]\nname = "refgs"\nversion = "9.9"\nrequires-python = ">=3.11"\ndependencies = ["torch==2.14.0"]\n'
-        "[project.optional-dependencies]\nfarm = []\n"
+        '[project.optional-dependencies]\nfarm = []\nlearned = ["matcher==1.0"]\n'
+        '[tool.uv]\nexclude-dependencies = ["left-out"]\n'
     )
     monkeypatch.setattr("scripts.build_extension.TORCH_BUILDS", ())
     write_locks(project, wheels)
@@ -69,7 +75,7 @@ def install(home):
 def test_a_release_is_installed_and_says_where_from(release, tmp_path):
     _, index = release
     assert install(tmp_path / "trainer") == ("done", "")
-    expected = f"All packages are those of the release, by their hashes: 2 from {index.as_uri()} (torch 2.14.0)"
+    expected = f"All packages are those of the release, by their hashes: 3 from {index.as_uri()} (torch 2.14.0)"
     assert installation.origin(tmp_path / "trainer") == expected
     assert expected in (tmp_path / "trainer.log").read_text()
     assert not (tmp_path / "trainer" / "torch.txt").exists()
@@ -123,7 +129,8 @@ def test_room_is_asked_for_what_is_locked(release, monkeypatch):
 def test_locks_have_hashes_and_no_address(release):
     wheels, index = release
     lock = (wheels / "lock.txt").read_text()
-    assert lock.count("--hash=sha256:") == 2 and "tiny==1.0" in lock and "torch==2.14.0" in lock
+    assert lock.count("--hash=sha256:") == 3
+    assert all(package in lock for package in ("matcher==1.0", "tiny==1.0", "torch==2.14.0"))
     assert "://" not in lock and str(index) not in lock
 
 
