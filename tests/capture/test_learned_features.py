@@ -65,6 +65,35 @@ def test_photos_that_sift_does_not_match(tmp_path, monkeypatch):
     assert distances.max() < 0.01 and angles.max() < 0.1
 
 
+def test_learned_matches_of_a_room_that_stands_still(tmp_path, monkeypatch):
+    """Check that cameras are found from the pixels in the masks, where cameras that follow the room explain nearly all matches.
+
+    Here all pairs of photos but one follow the room, in which the camera moves the other way round.
+    """
+    noise(tmp_path, len(POSES))
+    for number in range(len(POSES)):
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[HEIGHT // 4 :] = 255
+        write(tmp_path / "masks" / f"{number}.png", mask)
+    points = np.random.default_rng(1).uniform([-0.6, -0.6, -0.2], [0.6, 0.6, 1], (300, 3))
+
+    def match(photos, masks, file, progress) -> None:
+        object_and_room = [
+            np.concatenate([project(points, p) for p in both]) for both in zip(POSES, POSES[::-1], strict=True)
+        ]
+        places = {f"{n}": pixels.astype(np.float32) for n, pixels in enumerate(object_and_room)}
+        matched = np.column_stack([np.arange(300, dtype=np.uint32)] * 2)
+        pairs = {f"{a} {b}": matched + 300 * (not masks) for a, b in combinations(range(len(POSES)), 2)}
+        np.savez(file, **places, **pairs | {"0 7": matched})
+
+    monkeypatch.setattr(learned, "installed", lambda: True)
+    monkeypatch.setattr(learned, "match_photos", match)
+    found = find_cameras(tmp_path, nothing)
+    assert found["learned"] and found["inside"] and found["placed"] == len(POSES)
+    distances, angles = pose_errors(read_capture(tmp_path).views, POSES)
+    assert distances.max() < 0.01 and angles.max() < 0.1
+
+
 def test_sift_is_enough(tmp_path, monkeypatch):
     """Check that learned features are not tried where SIFT places all photos."""
     for number, pose in enumerate(POSES[:4]):

@@ -9,9 +9,10 @@ first, with or without masks.
 If the object stands on a turntable instead, the surroundings do not turn with it and lead to wrong cameras. Therefore matches at the same
 pixel in both photos are dropped. This does not help if the camera also moved a little: some photos then get cameras that follow the
 turntable, others follow the surroundings, and some get no camera. (The cameras of 66 photos of a bronze head were 19° wrong on average.)
-Such cameras leave many feature matches unexplained. If there are masks, the cameras are then found anew from the pixels inside them. The
-new cameras are kept if they explain more matches. Inside the masks, weaker features are used, too, because a shiny object has few strong
-ones. If many matches remain unexplained, the user gets a warning.
+Such cameras leave feature matches unexplained. If there are masks, the cameras are then found anew from the pixels inside them. The new
+cameras are kept if they explain more matches. Wrong cameras of few photos, or of photos with rich surroundings, may explain nearly all
+matches, so masks are tried where more than DOUBTFUL of them are unexplained. Inside the masks, weaker features are used, too, because a
+shiny object has few strong ones. If many matches remain unexplained, the user gets a warning.
 
 Cameras that contradict most of their photo's matches are removed from every result (`remove_unsupported`), so that no result wins by
 wrong cameras.
@@ -56,6 +57,7 @@ GROUPS, SPANS = 4, 4  # groups of photos that an error names, and spans of names
 SHEET = "unplaced/groups.png"  # in a folder of its own, where it is not taken for a photo
 LEARNED = f"learned features find more on plain and shiny things (to install them: {learned.INSTALL})"
 UNEXPLAINED = 0.2  # part of the matches, above which the cameras are not trusted
+DOUBTFUL = 0.02  # part of the matches, above which masks are tried; of 17 photos of a turning head, 0.04 with all cameras wrong
 DOUBTED = "as happens if an object turns in front of still surroundings: look at the cameras before you train (Show Cameras in Blender)"
 AGAIN = "or put something plain behind the object, or walk around it, and take the photos again"
 WITHOUT_MASKS = (
@@ -177,7 +179,8 @@ def _find_inside_if_needed(
 ) -> _Found:
     """Find cameras from the whole photos. If this fails and there are masks, find them anew from the pixels inside the masks.
 
-    It fails if too few photos get a camera, or if the cameras leave many feature matches unexplained. Returns the better result. If
+    It fails if too few photos get a camera, or if the cameras leave many feature matches unexplained. Returns the better result. Where
+    the cameras leave some matches unexplained, masks are tried, too. Their result is then kept if it leaves less than half as many. If
     `use_learned` is true, the features are learned ones.
     """
 
@@ -195,9 +198,11 @@ def _find_inside_if_needed(
         return _run_colmap_in_child(top, photos, masks, database, matches, report)
 
     found = find([], database)
-    if masks and (not _enough(found.placed, photos) or found.unexplained > UNEXPLAINED):
+    few = not _enough(found.placed, photos)
+    failed = few or found.unexplained > UNEXPLAINED
+    if masks and (few or found.unexplained > DOUBTFUL):
         inside = find(masks, database.with_name(f"{database.name}.inside"))
-        better = not _enough(found.placed, photos) or inside.unexplained < found.unexplained
+        better = few or inside.unexplained < found.unexplained * (1 if failed else 0.5)
         if _enough(inside.placed, photos) and better:
             return inside
     return found
