@@ -2,6 +2,7 @@
 
 import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 from mathutils import Matrix, Vector
@@ -15,6 +16,9 @@ from .capture_cameras import cameras_of, show_cameras
 from .decisions import find_decision
 from .regions import artists_region, region_settings, show_found_region
 from .run_toml import capture_of
+
+if TYPE_CHECKING:
+    import numpy as np
 
 CHOSEN_NEEDS = ("specular", "reflections")  # needs that have a property in `refgs_addon.properties`
 
@@ -131,13 +135,18 @@ def train_other_way(scene: bpy.types.Scene, folder: Path, need: str) -> jobs.Job
 
 
 def train_with_hint(
-    scene: bpy.types.Scene, collection: bpy.types.Collection, kind: str, ray: tuple[Vector, Vector] | None = None
+    scene: bpy.types.Scene,
+    collection: bpy.types.Collection,
+    kind: str,
+    ray: tuple[Vector, Vector] | None = None,
+    points: "np.ndarray | None" = None,
 ) -> jobs.Job:
     """Start a job that repeats most of a run's training, and keeps a part of the surface metal or paint. `kind` is "metal" or "paint".
 
-    The part is what the artist has chosen (`hints.chosen_part`). If nothing is chosen, it is the part that `ray` hits, a pair of origin and
-    direction in world space. The result goes into a new folder beside the run. Raises InputError if one of these is missing: the trainer,
-    the part, the run's checkpoint or its capture.
+    The part has the splats at `points` (P, 3), in the splats' coordinates. If None, it is what the artist has chosen
+    (`hints.chosen_part`). If nothing is chosen, it is the part that `ray` hits, a pair of origin and direction in world space. The result
+    goes into a new folder beside the run. Raises InputError if one of these is missing: the trainer, the part, the run's checkpoint or its
+    capture.
     """
     from .edit import splats_of
     from .export_run import run_folder
@@ -150,7 +159,8 @@ def train_with_hint(
     if capture is None or not capture.is_dir():
         raise InputError(f"the photos of {folder.name} are no longer at {capture}: put them back there")
     splats = splats_of(collection)
-    points = chosen_part(splats, bpy.context.view_layer.objects.active)
+    if points is None:
+        points = chosen_part(splats, bpy.context.view_layer.objects.active)
     if points is None:
         if ray is None:
             raise InputError("no part is chosen: click on it, or select its splats as points in Edit Mode")

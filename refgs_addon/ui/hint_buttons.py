@@ -1,20 +1,24 @@
 """Define the operator that trains a run again with a hint: a part of the object's surface is metal, or is paint."""
 
 import bpy
-from bpy.props import EnumProperty, FloatVectorProperty
+from bpy.props import EnumProperty, FloatVectorProperty, IntProperty
 from bpy_extras.view3d_utils import region_2d_to_origin_3d, region_2d_to_vector_3d
 from mathutils import Vector
 
+from ..errors import InputError
 from ..scene import training
+from ..scene.questions import questions
 from ..scene.run_parts import active_run
 from .operators import OnRun, has_trainer
+
+KINDS = "metal", "paint"
 
 
 class Hint(OnRun, bpy.types.Operator):
     """Train the active run again with a hint: the material of a part of the object, metal or paint.
 
-    The part is what the artist has selected: splats in Edit Mode, or a box or ball around splats. If nothing is selected, wait for a click
-    on the part in the 3D view.
+    The part is the piece of a `question` (see `scene.questions`), counted from 1. If it is 0, the part is what the artist has selected:
+    splats in Edit Mode, or a box or ball around splats. If nothing is selected, wait for a click on the part in the 3D view.
     """
 
     bl_idname = "refgs.hint"
@@ -23,6 +27,7 @@ class Hint(OnRun, bpy.types.Operator):
     kind: EnumProperty(name="Material", items=[("metal", "Metal", ""), ("paint", "Paint", "")])
     origin: FloatVectorProperty(name="Origin", description="Of the ray through the clicked pixel", options={"HIDDEN"})
     direction: FloatVectorProperty(name="Direction", description="Of this ray; zero without", options={"HIDDEN"})
+    question: IntProperty(name="Question", description="Number of the question that is answered; 0: none", min=0)
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -31,6 +36,8 @@ class Hint(OnRun, bpy.types.Operator):
     @classmethod
     def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         what = {"metal": "metal, such as chrome", "paint": "no metal: paint, plastic, glaze"}[properties.kind]
+        if properties.question:
+            return f"Train again, where the outlined piece is {what}"
         return (
             f"Train again, where a part is {what}. Click on the part: it is taken up to its creases. "
             "Or first select its splats in Edit Mode, or the box or ball of a material edit around them"
@@ -40,7 +47,7 @@ class Hint(OnRun, bpy.types.Operator):
         from ..scene.edit import splats_of
         from ..scene.hints import chosen_part
 
-        if chosen_part(splats_of(active_run(context)), context.view_layer.objects.active) is not None:
+        if self.question or chosen_part(splats_of(active_run(context)), context.view_layer.objects.active) is not None:
             return self.execute(context)
         context.window.cursor_modal_set("EYEDROPPER")
         context.window_manager.modal_handler_add(self)
@@ -61,7 +68,13 @@ class Hint(OnRun, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         ray = (Vector(self.origin), Vector(self.direction)) if any(self.direction) else None
-        job = training.train_with_hint(context.scene, active_run(context), self.kind, ray)
+        run, points = active_run(context), None
+        if self.question:
+            asked = questions(run)
+            if self.question > len(asked):
+                raise InputError(f"{run.name} has no question {self.question}: import it again")
+            points = asked[self.question - 1].points
+        job = training.train_with_hint(context.scene, run, self.kind, ray, points)
         self.report({"INFO"}, f"Training {job.name} with this part as {self.kind}")
 
 

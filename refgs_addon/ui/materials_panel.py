@@ -12,9 +12,11 @@ from ..preferences import wrapped_text
 from ..scene.doubt import doubt_shown, doubt_words, has_doubt, show_doubt
 from ..scene.edit import add_edit, edits, remove_edit
 from ..scene.material_presets import PRESETS, ROOT, materials, remove_material, save_material, set_material
+from ..scene.questions import questions
 from ..scene.run_parts import active_run, parts
 from .export_menu import ApplyEdits
-from .hint_buttons import Hint
+from .hint_buttons import KINDS, Hint
+from .icons import thumbnail
 from .operators import OnRun, ReportsErrors, select_only, show_materials
 from .panels import Tab
 
@@ -163,8 +165,10 @@ class MaterialPanel(Tab, bpy.types.Panel):
                 layout.operator(ApplyEdits.bl_idname, icon="CHECKMARK")
 
         row = layout.row(align=True)
-        row.operator(Hint.bl_idname, text="This Part Is Metal", icon="SHADING_RENDERED").kind = "metal"
-        row.operator(Hint.bl_idname, text="This Part Is Paint", icon="SHADING_SOLID").kind = "paint"
+        metal = row.operator(Hint.bl_idname, text="This Part Is Metal", icon="SHADING_RENDERED")
+        paint = row.operator(Hint.bl_idname, text="This Part Is Paint", icon="SHADING_SOLID")
+        metal.kind, paint.kind = KINDS
+        metal.question = paint.question = 0
 
     def _doubt(self, layout: bpy.types.UILayout, run: bpy.types.Collection, context: bpy.types.Context) -> None:
         width = int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6  # letters
@@ -172,6 +176,15 @@ class MaterialPanel(Tab, bpy.types.Panel):
             wrapped_text(layout, words[0].upper() + words[1:], width, "QUESTION")
         on = doubt_shown(run)
         layout.operator(ShowDoubt.bl_idname, icon="HIDE_OFF" if on else "HIDE_ON", depress=on).on = not on
+        for number, question in enumerate(questions(run), 1):
+            box = layout.box()
+            box.label(text=f"Metal or paint? {question.part:.0%}, now {question.now}", icon="QUESTION")
+            if shown := thumbnail(question.picture, round(1e4 * question.part)):
+                box.template_icon(icon_value=shown, scale=6)
+            row = box.row(align=True)
+            for kind in KINDS:
+                button = row.operator(Hint.bl_idname, text=kind.capitalize(), depress=kind == question.now)
+                button.kind, button.question = kind, number
 
     def _edit(self, box: bpy.types.UILayout, edit: bpy.types.NodesModifier) -> None:
         row = box.row(align=True)

@@ -104,6 +104,7 @@ def drawn(scene):
     layout, buttons = Mock(), {}
     layout.column.return_value = layout
     layout.operator = lambda name, **options: buttons.setdefault(name, SimpleNamespace(**options))
+    layout.box.return_value.label, layout.box.return_value.row.return_value.operator = layout.label, layout.operator
     context = Mock(scene=scene, view_layer=bpy.context.view_layer)
     context.region.width, context.preferences.system.ui_scale = 600, 1
     MaterialPanel.draw(SimpleNamespace(layout=layout, _doubt=partial(MaterialPanel._doubt, None)), context)
@@ -140,3 +141,14 @@ def test_a_picture_of_the_mesh_has_both_colors(doubtful, scene, tmp_path):
     for color in (TOLD, DOUBTFUL):
         encoded = [12.92 * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055 for x in color[:3]]
         assert (np.abs(solid - encoded).max(axis=1) < 0.02).mean() > 0.1
+
+
+@pytest.mark.parametrize("damaged", ["", "{", '{"questions": [{}]}', "[]"])
+def test_the_panel_asks_what_photos_leave_open(doubtful, addon, damaged):
+    rows = [{"part": part, "now": "paint", "picture": "questions/1.png", "points": [[0, 0, 0]]} for part in (0.2, 0.1)]
+    (doubtful / "questions.json").write_text(damaged or json.dumps({"questions": rows}))
+    import_run(doubtful, addon)
+    labels, buttons = drawn(addon)
+    asked = [] if damaged else ["Metal or paint? 20%, now paint", "Metal or paint? 10%, now paint"]
+    assert [label for label in labels if "?" in label] == asked
+    assert ("refgs.hint" in buttons) == bool(asked)

@@ -181,3 +181,17 @@ def test_what_a_hint_needs(still, addon, tmp_path):
     with pytest.raises(InputError, match="still has no checkpoint"):
         training.train_with_hint(addon, still.collection, "metal", down)
     assert not addon.refgs.runs and not (tmp_path / "still 2").exists()
+
+
+def test_an_answer_to_a_question_starts_a_training_with_the_hint(still, addon, tmp_path):
+    points = spread(BALL)[:9].tolist()
+    row = {"part": 0.2, "now": "paint", "picture": "questions/1.png", "points": points}
+    (tmp_path / "still" / "questions.json").write_text(json.dumps({"questions": [row]}))
+    addon.refgs.mesh = False
+    with pytest.raises(RuntimeError, match="has no question 2: import it again"):
+        bpy.ops.refgs.hint(kind="metal", question=2)
+    assert bpy.ops.refgs.hint(kind="metal", question=1) == {"FINISHED"}
+    assert final_state(jobs.JOBS[-1]) == "done"
+    with open(json.loads((tmp_path / "still 2" / "started").read_text())["hints"]) as file:
+        (hint,) = json.load(file)["hints"]
+    assert hint == {"kind": "metal", "points": points}

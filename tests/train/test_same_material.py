@@ -3,14 +3,16 @@
 import json
 import math
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from refgs.formats.splats import read_splats
 from refgs.model.surfels import activate, raw_metallic
 from refgs.train.keep.asset import write_asset
-from refgs.train.material import metals, mirrored, same_material
+from refgs.train.material import metals, mirrored, questions, same_material
 from refgs.train.material.mirrored import Fit
 from refgs.train.material.observe import Seen
 from refgs.train.trainer import ACTIONS
@@ -163,7 +165,7 @@ def test_what_photos_do_not_tell_is_in_doubt(metallic):
     ratio = torch.where(ball & (points[:, 2] > 1), 0.3, 1.0)
     doubt = same_material.doubt(*observed(points, normals, ratio, torch.full((len(points),), raw_metallic(metallic))))
     assert bool((doubt[ball & (points[:, 2] > 1.2)] < 0.1).all())
-    assert bool((doubt[ball] < metals.DOUBTFUL).all()), "its lower half is of a piece with its upper half"
+    assert bool((doubt[ball] < questions.DOUBTFUL).all()), "its lower half is of a piece with its upper half"
     assert bool((doubt[~ball] > 0.99).all())
 
 
@@ -172,6 +174,38 @@ def test_clear_paint_is_not_in_doubt():
     ratio = torch.where(ball, 1.0, 4.0)
     doubt = same_material.doubt(*observed(points, normals, ratio, torch.full((len(points),), raw_metallic(0.98))))
     assert bool((doubt[~ball] < 0.1).all()) and bool((doubt[ball] > 0.99).all())
+
+
+def test_pieces_in_doubt_end_at_creases():
+    """Check that a ball and the board that it stands on are two pieces, the larger one first, without what is not in doubt."""
+    points, normals, ball = ball_on_board()
+    surfels, seen, _ = observed(points, normals, torch.ones(len(points)), torch.zeros(len(points)))
+    doubt = torch.where(ball & (points[:, 2] > 1.2), 0.1, 0.9)
+    weight = torch.where(ball, 3.0, 1.0).numpy()
+    first, second, *others = questions.pieces(surfels, seen, doubt, weight)
+    assert np.array_equal(first, (ball & (points[:, 2] <= 1.2)).numpy()) or np.array_equal(first, (~ball).numpy())
+    assert np.array_equal(first | second, (doubt > 0.5).numpy()) and not others
+    assert weight[first].sum() >= weight[second].sum()
+
+
+def test_a_question_is_asked_about_what_photos_leave_open(made):
+    """Check the question about a ball under even light, its picture, and that nothing is asked of one that photos show clearly."""
+    show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
+    write_asset(made.state)
+    assert not (made.state.folder / "questions.json").exists()
+    made.state.learned["environment"].data[:] = made.state.learned["environment"].data.mean()
+    write_asset(made.state)
+    (asked,) = json.loads((made.state.folder / "questions.json").read_text())["questions"]
+    assert asked["part"] > 0.9 and asked["now"] == "metal"
+    splats = read_splats(made.state.folder / "splats.ply").positions
+    assert cKDTree(splats).query(asked["points"])[0].max() < 1e-4 and len(asked["points"]) > 0.9 * len(splats)
+    picture = cv2.imread(str(made.state.folder / asked["picture"]))
+    photo, metal, paint = np.split(picture.astype(float), 3, axis=1)
+    assert np.abs(photo - metal).mean() < 30, "the learned metal explains the photos"
+    assert np.abs(metal - paint).mean() > 1, "the two differ"
+    show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
+    write_asset(made.state)
+    assert not (made.state.folder / "questions.json").exists() and not (made.state.folder / "questions").exists()
 
 
 def test_what_hardly_any_pixel_shows_is_in_doubt():
@@ -184,10 +218,10 @@ def test_what_hardly_any_pixel_shows_is_in_doubt():
 def test_how_much_of_the_surface_is_in_doubt_is_said(made):
     """Check a metal ball that photos show clearly, and a light that is the same from everywhere, under which they tell nothing."""
     show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
-    doubt, facts = metals.doubt(made.state)
+    doubt, facts, _ = metals.doubt(made.state)
     assert len(doubt) == made.state.learned.count and facts["part"] < 0.05
     made.state.learned["environment"].data[:] = made.state.learned["environment"].data.mean()
-    doubt, facts = metals.doubt(made.state)
+    doubt, facts, _ = metals.doubt(made.state)
     assert facts["part"] > 0.9 and facts["what"] == made.state.decided["doubt"]
     assert facts["what"] == f"photos do not tell metal from paint on {facts['part']:.0%} of the surface"
 
@@ -197,7 +231,7 @@ def test_the_asset_has_the_doubt_of_the_surfels_that_are_written(made):
     position, light = made.state.learned["position"], made.state.learned["environment"]
     position.data[0] = 0  # within the ball, so that no photo shows it
     light.data[:] = light.data.mean()
-    doubt, facts = metals.doubt(made.state)
+    doubt, facts, _ = metals.doubt(made.state)
     write_asset(made.state)
     splats = read_splats(made.state.folder / "splats.ply")
     row = {tuple(place): i for i, place in enumerate(position.tolist())}

@@ -24,6 +24,7 @@ from refgs.run import OCCLUDER
 from refgs.run_folder import SPLATS, update_metrics
 from refgs.train.decide import needs
 from refgs.train.decide.need import Given
+from refgs.train.keep.questions import write_questions
 from refgs.train.learn import poses
 from refgs.train.learn.exposures import exposure
 from refgs.train.learn.poses import Poses
@@ -37,7 +38,7 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
     These are the surfels (splats.ply), the light (environment.exr), and the optional features that the training left out or kept
     (needs.json). If inter-reflection was traced, the object's mesh is written to occluder.ply. If exposures or poses were learned,
     cameras.json is written again to include them. If photos decide what is metal, each surfel's doubt is added to splats.ply, and facts
-    about it to metrics.json (see `metals.doubt`).
+    about it to metrics.json (see `metals.doubt`). Questions about pieces in doubt are written to questions.json.
 
     splats.ply is written last, because a run that has it counts as finished. `before_splats` is called just before. Raises InputError if
     the photos show no surfel in the region to train.
@@ -55,9 +56,9 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
     splats = to_splats(surfels.chosen(kept))
     splats.constants = constants
     if found := metals.doubt(state):
-        doubt, facts = found
-        splats.doubt = doubt.numpy()[kept.numpy(force=True)]
-        update_metrics(state.folder, {"doubt": facts})
+        splats.doubt = found.values.numpy()[kept.numpy(force=True)]
+        update_metrics(state.folder, {"doubt": found.facts})
+    write_questions(state.folder, found.questions if found else [], surfels.positions, kept)
     splats.normals *= side[kept].numpy(force=True)[:, None]
     splats.normals = blended_normals(splats)
     _write_light_and_mesh(state)

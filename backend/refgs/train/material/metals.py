@@ -7,10 +7,12 @@ If nearly all of the surface changes as coloured metals do, metallic values are 
 parts of the surface back into paint, which explains the photos about as well.
 """
 
+from typing import NamedTuple
+
 import torch
 
 from refgs.model.surfels import raw_metallic
-from refgs.train.material import mirrored, same_material
+from refgs.train.material import mirrored, questions, same_material
 from refgs.train.material.changes import falls_as_metal, shines_as_metal
 from refgs.train.material.changing_light import explained
 from refgs.train.material.observe import Kinds, observe_changes
@@ -24,7 +26,6 @@ CERTAIN = 0.85  # part of the surface that shines as coloured metals do: all is 
 MOSTLY = 0.6
 TELLING = 0.3  # fraction of the surface that must be coloured to tell about the rest; a bronze head has 0.48
 TOLD = 0.005  # a change of a larger fraction of the surface is announced
-DOUBTFUL = 0.5  # photos do not tell metal from paint if doubt is at least this
 HELD = Kinds(metal=0.98, paint=0.002)  # metallic that does not learn, in the order of `hints.KINDS`
 
 
@@ -121,27 +122,40 @@ def judge(state: State, step: Step) -> None:
         state.announce("mirrored", words, detail=True)
 
 
+class Doubt(NamedTuple):
+    """Hold what photos leave open about metal and paint.
+
+    - `values` (N,): each surfel's doubt (see `same_material.doubt`)
+    - `facts`: for metrics.json. `part` is the fraction of the surface whose doubt is at least `questions.DOUBTFUL`. `what` says so to the
+      user, if `part` is more than TOLD.
+    - `questions`: the largest pieces in doubt
+    """
+
+    values: torch.Tensor
+    facts: dict[str, float | str]
+    questions: list[questions.Question]
+
+
 @torch.no_grad()
-def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
+def doubt(state: State) -> Doubt | None:
     """Measure each surfel's doubt: 0 where photos clearly show metal or paint, 1 where they do not show which (see `same_material.doubt`).
 
-    Returns the doubt (N,), and facts for metrics.json: `part` is the fraction of the surface whose doubt is at least DOUBTFUL. If this
-    fraction is more than TOLD, it is announced to the user, and `what` is the text. Surfels whose metallic value is held (see `hold`) have
-    doubt 0. Returns None if photos do not decide what is metal, for example without specular shading, or if a photo has no mask.
+    If a part of the surface is in doubt, it is announced to the user. Surfels whose metallic value is held (see `hold`) have doubt 0.
+    Returns None if photos do not decide what is metal, for example without specular shading, or if a photo has no mask.
     """
     if not state.from_hull or not metals_decidable(state, state.iteration):
         return None
     surfels, seen, fit = mirrored.fit_both(state)
-    found = same_material.doubt(surfels, seen, fit)
+    values = same_material.doubt(surfels, seen, fit)
     if "held" in state.learned:
-        found[state.learned["held"].cpu() & (seen.pixels > same_material.FRINGE)] = 0
+        values[state.learned["held"].cpu() & (seen.pixels > same_material.FRINGE)] = 0
     weight = seen.pixels * state.wanted().cpu()
-    part = float(weight[found >= DOUBTFUL].sum()) / max(float(weight.sum()), 1e-6)
+    part = float(weight[values >= questions.DOUBTFUL].sum()) / max(float(weight.sum()), 1e-6)
     facts: dict[str, float | str] = {"part": part}
     if part > TOLD:
         facts["what"] = f"photos do not tell metal from paint on {part:.0%} of the surface"
         state.announce("doubt", facts["what"])
-    return found, facts
+    return Doubt(values, facts, questions.ask(state, surfels, seen, fit, values))
 
 
 @torch.no_grad()

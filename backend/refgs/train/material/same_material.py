@@ -90,7 +90,7 @@ def doubt(surfels: Surfels, seen: Seen, fit: Fit) -> Tensor:
 
 def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray, np.ndarray]:
     """Return the Laplacian, which surfels can be judged, and evidence for metal and for paint."""
-    graph, part = _laplacian(surfels.positions, seen), (seen.pixels > FRINGE).double().numpy()
+    graph, part = laplacian(surfels.positions, seen), (seen.pixels > FRINGE).double().numpy()
     ratio = np.asarray((fit.ratio.clamp(1e-3, 1e3).log().double() * fit.seen).numpy())
     mirrors = (fit.slope > SLOPE) & (fit.reflectance.amax(dim=1) > REFLECTANCE)
     metal = np.where(mirrors.numpy() & (ratio < np.log(RATIO.metal)), np.clip(-ratio, 0, SURE), 0) * part
@@ -110,7 +110,7 @@ def _solve(graph: sparse.csr_matrix, weight: np.ndarray, weighted: np.ndarray) -
     return cg(reach * graph + sparse.diags(weight), weighted, rtol=CG_TOLERANCE, maxiter=CG_STEPS)[0]
 
 
-def _laplacian(positions: Tensor, seen: Seen) -> sparse.csr_matrix:
+def laplacian(positions: Tensor, seen: Seen) -> sparse.csr_matrix:
     """Return the Laplacian (N, N) of neighbouring surfels, with edge weights from 0 to 1."""
     points, near = positions.double().numpy(), neighbours(positions, LINKED + 1)[:, 1:].numpy()
     count = len(points)
