@@ -14,8 +14,8 @@ from scripts.demo.shapes import Scene
 REFLECTIVE = ("ball", "car", "figure", "helmet", "jar", "plate", "rings", "teapot", "toaster")
 DULL = ("brushed", "embossed", "part", "tarnished")
 """Metals that look matte, or are a small part of something matte."""
-AMBIGUOUS = ("bowl", "night", "silver", "twins")
-"""Photos of these can be explained twice: a mirror in the dark, silver among white, paint like copper, a hollow with content."""
+AMBIGUOUS = ("bowl", "dark", "lamps", "night", "silver", "twins")
+"""Photos of these can be explained twice: mirrors in the dark, silver among white, paint like metal, a hollow with content."""
 MATTE = ("matte",)
 NAMES = REFLECTIVE + AMBIGUOUS + DULL + MATTE
 

@@ -1,4 +1,4 @@
-"""Make soft lights: panoramas (H, 2·H, 3) of linear radiance in Blender's orientation, without a small bright lamp."""
+"""Make lights: panoramas (H, 2·H, 3) of linear radiance in Blender's orientation. Only `cellar` has small bright lamps."""
 
 import numpy as np
 
@@ -56,3 +56,18 @@ def white_studio() -> np.ndarray:
     radiance = mix(radiance, (0.03, 0.03, 0.03), slit)
     edge = step(0.02, 0.0, np.abs(up + 0.35))
     return mix(radiance, (0.35, 0.34, 0.33), edge).reshape(HEIGHT, 2 * HEIGHT, 3)
+
+
+def cellar() -> np.ndarray:
+    """Make a dark cellar with two bulbs, a tube lamp and a small window at dusk. The walls are a thousand times darker than the lamps."""
+    way = _ways()
+    up = way[:, 2]
+    radiance = mix((0.003, 0.0025, 0.002), (0.014, 0.012, 0.010), step(-1.0, 1.4, clouds(way, 0.4, seed=8) + up))
+    window = step(0.16, 0.14, np.abs(way[:, 0] + 0.2)) * step(0.11, 0.09, np.abs(up - 0.35)) * (way[:, 1] < 0)
+    radiance = mix(radiance, (0.22, 0.30, 0.42), window)
+    tube = step(0.022, 0.014, np.abs(up - 0.62)) * step(0.34, 0.32, np.abs(way[:, 1] - 0.1)) * (way[:, 0] < 0)
+    radiance = mix(radiance, (36.0, 40.0, 38.0), tube)
+    for lamp, bright in (((0.7, 0.35, 0.60), 260.0), ((0.25, -0.75, 0.30), 130.0)):
+        angle = np.arccos((way @ (np.array(lamp) / np.linalg.norm(lamp))).clip(-1, 1))
+        radiance = mix(radiance, bright * np.array([1.0, 0.86, 0.66]), step(0.048, 0.036, angle))
+    return radiance.reshape(HEIGHT, 2 * HEIGHT, 3)
