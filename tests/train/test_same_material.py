@@ -60,6 +60,31 @@ def test_what_no_photo_shows_is_not_told(made):
     assert not fit.seen.any() and not seen.weight.any() and seen.pixels.any()
 
 
+@pytest.mark.parametrize(
+    ("diffuse", "reflectance", "metal"), [(0.0, 0.9, True), (0.0, 0.5, True), (0.005, 0.04, False), (0.2, 0.04, False)]
+)
+def test_a_metal_in_the_dark_is_told_by_what_it_mirrors_of_the_object(diffuse, reflectance, metal):
+    """Check that a light which is learned a hundred times too bright does not matter where surfels mirror the object.
+
+    The four surfaces are two metals, a black glaze and a bright one. In half of the photos, they mirror the object, in the others a room
+    with a radiance of 0.002.
+    """
+    count, photos = 80, 12
+    generator = torch.Generator().manual_seed(0)
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(count, photos, 3)
+    there = 0.1 + 0.3 * torch.rand(photos, 1, 3, generator=generator).expand(photos, count, 3)
+    met = (torch.arange(photos) % 2 == 0)[:, None].expand(photos, count)
+    shown = diffuse + reflectance * torch.where(met[..., None], there, 0.002).transpose(0, 1)
+    seen = Seen(shown, torch.full((count, photos), 4.0), torch.full((count,), 48.0), shown.mean(dim=1), up, up)
+    learned = torch.where(met[..., None], there, 0.2)
+    positions = torch.rand(count, 3, generator=generator)
+    fit = mirrored._fit(seen, (([each] * 3, which) for each, which in zip(learned, met, strict=True)), positions)
+    assert bool(fit.by_object.all()) == bool(fit.by_object.any()) == metal
+    if metal:
+        assert float(fit.ratio.max()) < same_material.RATIO.metal and float(fit.slope.min()) > same_material.SLOPE
+        assert torch.allclose(fit.reflectance, torch.tensor(reflectance), atol=0.03)
+
+
 def ball_on_board(count=4000):
     """Return points and normals of a ball that stands on a board, and which of them are the ball's."""
     generator = torch.Generator().manual_seed(0)
@@ -91,7 +116,7 @@ def observed(points, normals, ratio, metallic, mean=None, shown=None):
     pixels = 9 * (torch.ones(count) if shown is None else shown.float())
     seen = Seen(mean[:, None], 9 * one, pixels, mean, normals[:, None], normals[:, None])
     told = torch.ones(count, dtype=torch.bool)
-    fit = Fit(ratio, torch.full((count,), 0.5), torch.full((count, 3), 0.8), torch.full((count,), 0.2), told)
+    fit = Fit(ratio, torch.full((count,), 0.5), torch.full((count, 3), 0.8), torch.full((count,), 0.2), told, ~told)
     return activate(start), seen, fit
 
 

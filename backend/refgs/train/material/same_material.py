@@ -62,13 +62,15 @@ def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
     likely = _solve(graph, metal + AGAINST_METAL * paint + SO_FAR.paint * part + none, metal)
     kept = SO_FAR.metal * was * part
     unlikely = _solve(graph, metal + paint + kept + none, metal + kept)
-    sure = np.clip(metal, 0, 1) * (likely > LIKELY) * np.where(was, 1, FITTED)
+    given = fit.by_object.numpy()
+    sure = np.clip(metal, 0, 1) * (likely > LIKELY) * np.where(was | given, 1, FITTED)
     learned, fitted = (
         torch.cat([colour, rough[:, None]], dim=1).double().numpy()
         for colour, rough in ((surfels.albedo, surfels.roughness), (fit.reflectance, fit.roughness))
     )
-    # Surfels that were paint so far have learned the colour of what they mirror, so their fitted material is used.
-    material = np.where(was[:, None], learned, fitted)
+    # Surfels that were paint so far have learned the colour of what they mirror, so their fitted material is used. Metals have learned a
+    # wrong base colour where the light is wrong, but what they show of the object tells the right one.
+    material = np.where((was & ~given)[:, None], learned, fitted)
     mean = (material * sure[:, None]).sum(axis=0) / max(sure.sum(), 1e-9)
     like = [_solve(graph, sure + none, sure * of + none * all_of) for of, all_of in zip(material.T, mean, strict=True)]
     turned = torch.from_numpy(~was & (likely > LIKELY)), torch.from_numpy(was & (unlikely < UNLIKELY))
