@@ -20,9 +20,10 @@ from refgs.compare import metrics
 from refgs.compare.pictures import as_bytes, composite, write_png
 from refgs.render.align import fitted
 from refgs.settings import load_settings
+from refgs.spread import spread
 from refgs.train.keep.measures import held_out_psnr
 from refgs.train.learn.poses import Poses, shifts
-from refgs.train.state import State, spread
+from refgs.train.state import State
 from refgs.train.trainer import Trainer
 
 VIEWS = 4  # held-out views whose poses are fitted
