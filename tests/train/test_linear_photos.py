@@ -45,10 +45,7 @@ def test_a_value_between_two_8_bit_codes_comes_into_the_loss(tmp_path, bits):
 
 
 def test_light_brighter_than_white_is_recovered_from_exr(tmp_path, monkeypatch):
-    """Check that a training on EXR photos of a mirror ball finds the radiance of a lamp, which is 5 times as bright as white.
-
-    From 8-bit photos, which are clipped where they show the lamp, the same training finds 0.35 to 0.65 of its radiance.
-    """
+    """Check that a training on EXR photos of a mirror ball finds how much light comes from a lamp, which is 5 times as bright as white."""
     monkeypatch.setattr(analytic, "sky", with_lamp)
     folder = tmp_path / "capture"
     write_ball_capture(folder, 48)
@@ -60,7 +57,10 @@ def test_light_brighter_than_white_is_recovered_from_exr(tmp_path, monkeypatch):
             write_exr(folder / f"{frame['file_path']}.exr", np.dstack([linear * alpha, alpha]))
     made = trained(folder, tmp_path / "run", "surfels.metallic=0.9", "light.exposure=off", total=TOTAL)
     albedo = made.state.surfels().albedo.mean(dim=0).detach().numpy()
-    found = (made.state.environment().panorama(32) * albedo).max(axis=(0, 1))
-    true = (with_lamp(directions(32, 64)) * F0).max(axis=(0, 1))
-    assert (found / true > 0.68).all() and (found / true < 1.2).all()
+    towards = directions(32, 64)
+    # Single texels tell little: reflections are blurred, so that the brightest one may be too bright and its neighbours too dim.
+    near = np.sin((np.arange(32) + 0.5) / 32 * np.pi)[:, None] * (towards @ LAMP > np.cos(0.6))
+    found, true = made.state.environment().panorama(32) * albedo, with_lamp(towards) * F0
+    ratio = (found * near[..., None]).sum(axis=(0, 1)) / (true * near[..., None]).sum(axis=(0, 1))
+    assert (ratio > 0.8).all() and (ratio < 1.2).all()
     assert held_out_psnr(made.state) > 28

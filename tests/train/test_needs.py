@@ -435,7 +435,7 @@ def test_specular_on_synthetic_surfels(ball_capture, tmp_path):
     for metallic, roughness, least, most in ((5.0, -3.0, 3.0, math.inf), (-20.0, 20.0, -math.inf, 0.3)):
         put(made, metallic=metallic, roughness=roughness)
         with torch.no_grad():
-            made.state.learned["environment"].copy_(light)
+            made.state.learned["environment"].copy_(torch.nn.functional.softplus(light).log())
             for view, photo in enumerate(made.state.photos):
                 made.state.photos[view] = with_rendering(made.state, photo, noise=0.01)
         assert least < probe.specular_explains(made.state).whole < most

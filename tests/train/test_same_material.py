@@ -20,7 +20,7 @@ from tests.makers.lamps import show
 from tests.makers.training import do, put
 from tests.makers.training import trainer as small
 
-DIM = 1.0  # of lamps whose mirror images are not clipped: a radiance of 1.3, beside 0.2
+DIM = 1.3  # radiance of lamps whose mirror images are not clipped
 GOLD = [3.0, 1.0, -1.0]  # logits: 0.95, 0.73, 0.27
 ALL = ["surfels.sh_degree=0", "needs.specular=on", "needs.outside=off", "indirect.every=100"]
 

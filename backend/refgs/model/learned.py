@@ -19,7 +19,7 @@ LIMITS = {
     "metallic": (-LOGIT / 2, LOGIT / 2),  # its activation approaches its limits as the square of a logistic function
     "exposure": (-LOGIT, LOGIT),  # natural logarithm of a factor: 12 is 17 stops
 }
-DARKEST = -LOGIT  # raw light; below, softplus' slope, about the radiance itself, is too small to learn by
+DARKEST = -LOGIT  # raw light, a logarithm; photos tell no darker light apart
 SMALLEST, LARGEST = 1e-6, 1e2  # a surfel's scale, in scene radii
 
 _Tensor = struct("Learned", "adam.cpp")

@@ -35,18 +35,21 @@ MIRROR_LOGIT = 7.0  # of a perfect mirror: the logit of its base colour, and the
 
 
 class LinearLight:
-    """Represent light by linear HDR radiance. Pictures show it sRGB-encoded."""
+    """Represent light by linear HDR radiance. Pictures show it sRGB-encoded.
+
+    Raw texels are logarithms. So a step of Adam changes a lamp by as large a part as a dark wall: lamps are hundreds of times as bright.
+    """
 
     display = False
-    brightest = 1e8  # raw texel; beyond it, sums lose what is small
+    brightest = math.log(1e8)  # raw texel; beyond it, sums lose what is small
 
     def radiance(self, raw: Tensor) -> Tensor:
         """Convert raw texels to radiance. Raw texels are the trained parameters of the light."""
-        return torch.nn.functional.softplus(raw)
+        return raw.exp()
 
-    def raw(self, radiance: float) -> float:
-        """Convert radiance to a raw texel. This is the inverse of `radiance()`."""
-        return math.log(math.expm1(radiance))
+    def raw(self, radiance: Tensor) -> Tensor:
+        """Convert radiance to raw texels. This is the inverse of `radiance()`."""
+        return radiance.log()
 
     def encode(self, radiance: Tensor) -> Tensor:
         """Convert radiance to the values that a picture stores."""
@@ -70,8 +73,8 @@ class ScreenLight(LinearLight):
     def radiance(self, raw: Tensor) -> Tensor:
         return torch.sigmoid(raw)
 
-    def raw(self, radiance: float) -> float:
-        return math.log(radiance / (1 - radiance))
+    def raw(self, radiance: Tensor) -> Tensor:
+        return radiance.logit()
 
     def encode(self, radiance: Tensor) -> Tensor:
         return radiance

@@ -6,8 +6,10 @@ import torch
 from torch import Tensor
 
 from refgs.model.surfels import raw_metallic
+from refgs.render.baselines import LinearLight
 from refgs.train.material.metals import HELD
 
+DARKEST = 1e-6  # radiance
 RENAMED = {
     "poses": "poses.values",
     "mirrored": "light.weight",
@@ -16,14 +18,20 @@ RENAMED = {
 }
 
 
-def as_of_today(tensors: dict[str, Tensor], facts: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def as_of_today(
+    tensors: dict[str, Tensor], facts: dict[str, Any], light: LinearLight
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Convert the tensors and facts of a checkpoint of release 0.1.0 to the present form. Return those of later releases unchanged.
 
     0.1.0 had no mask `held`: surfels with a metallic value in HELD did not learn it. All parts (see `Part`) shared one table of facts.
+    Linear light was the softplus of raw texels, and is their exponential now. `light` is how the run represents light.
     """
     if "residual" in facts:
         return tensors, facts
     tensors = {RENAMED.get(name, name): value for name, value in tensors.items()}
+    if not light.display and (raw := tensors.get("environment")) is not None:
+        tensors = {name: value for name, value in tensors.items() if not name.startswith("adam.environment.")}
+        tensors["environment"] = light.raw(torch.nn.functional.softplus(raw).clamp_min(DARKEST))
     if (metallic := tensors.get("parameter.metallic")) is not None:
         tensors["parameter.held"] = torch.isin(metallic, torch.tensor([raw_metallic(value) for value in HELD]))
     elif "constant.metallic" in tensors:

@@ -36,7 +36,7 @@ def restore(state: State, run: Path) -> None:
 
     Raises `checkpoint.NoCheckpoint` if there is none, and InputError if this release of RefGS cannot use it.
     """
-    tensors, tables = as_of_today(*checkpoint.load(run / "checkpoints", state.report))
+    tensors, tables = as_of_today(*checkpoint.load(run / "checkpoints", state.report), state.method.light)
     facts = validated(tables, Facts, str(run / "checkpoints"), "Train again into a new folder.")
     if not belong_together(tensors):
         raise InputError(f"{run / 'checkpoints'}: the tensors of the checkpoint do not belong together: train again")

@@ -31,7 +31,7 @@ class MirroredLight(Part):
 
 def start_value(state: State) -> float:
     """Return the value, before activation, at which the light's texels start."""
-    return state.method.light.raw(state.settings.environment.radiance)
+    return float(state.method.light.raw(torch.tensor(state.settings.environment.radiance, dtype=torch.double)))
 
 
 def first_resolution(settings: Settings) -> int:
@@ -66,7 +66,7 @@ def diffuse(state: State, step: Step) -> None:
 
     Both effects are proportional to the light's learning rate. They are separate from the optimiser's step, like decoupled weight decay
     (Loshchilov and Hutter 2019). Where the photos agree on a texel, the optimiser is stronger than this step: details and colours stay.
-    Where only noise moves the texels, they become alike and grey. The mean over all texels and channels does not change.
+    Where only noise moves the texels, they become alike and grey. The mean of the texels' logarithms does not change.
     """
     side = math.isqrt(len(state.learned["environment"]) // 6)
     rate, settings = state.learned.rates["environment"], state.settings.environment
