@@ -75,7 +75,8 @@ def test_a_metal_in_the_dark_is_told_by_what_it_mirrors_of_the_object(diffuse, r
     there = 0.1 + 0.3 * torch.rand(photos, 1, 3, generator=generator).expand(photos, count, 3)
     met = (torch.arange(photos) % 2 == 0)[:, None].expand(photos, count)
     shown = diffuse + reflectance * torch.where(met[..., None], there, 0.002).transpose(0, 1)
-    seen = Seen(shown, torch.full((count, photos), 4.0), torch.full((count,), 48.0), shown.mean(dim=1), up, up)
+    weight = torch.full((count, photos), 4.0)
+    seen = Seen(shown, weight, 0 * weight, torch.full((count,), 48.0), shown.mean(dim=1), up, up)
     learned = torch.where(met[..., None], there, 0.2)
     positions = torch.rand(count, 3, generator=generator)
     fit = mirrored._fit(seen, (([each] * 3, which) for each, which in zip(learned, met, strict=True)), positions)
@@ -114,7 +115,7 @@ def observed(points, normals, ratio, metallic, mean=None, shown=None):
     mean = torch.full((count, 3), 0.5) if mean is None else mean
     one = torch.ones(count, 1)
     pixels = 9 * (torch.ones(count) if shown is None else shown.float())
-    seen = Seen(mean[:, None], 9 * one, pixels, mean, normals[:, None], normals[:, None])
+    seen = Seen(mean[:, None], 9 * one, 0 * one, pixels, mean, normals[:, None], normals[:, None])
     told = torch.ones(count, dtype=torch.bool)
     fit = Fit(ratio, torch.full((count,), 0.5), torch.full((count, 3), 0.8), torch.full((count,), 0.2), told, ~told)
     return activate(start), seen, fit

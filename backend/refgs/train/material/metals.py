@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import torch
 
-from refgs.model.surfels import raw_metallic
-from refgs.train.material import mirrored, questions, same_material
+from refgs.model.surfels import Surfels, raw_metallic
+from refgs.train.material import mirrored, questions, same_material, shown_light
 from refgs.train.material.changes import falls_as_metal, shines_as_metal
 from refgs.train.material.changing_light import explained
-from refgs.train.material.observe import Kinds, observe_changes
+from refgs.train.material.observe import Kinds, Seen, observe_changes
 from refgs.train.part import Part
 from refgs.train.state import State
 from refgs.train.timeline import Step, metals_decidable
@@ -120,6 +120,37 @@ def judge(state: State, step: Step) -> None:
     if max(parts) > TOLD:
         words = f"{parts[0]:.1%} of the surface is of a piece with metals, {parts[1]:.1%} does not mirror as metals do"
         state.announce("mirrored", words, detail=True)
+    if parts[0] > TOLD and fit.by_object.any():
+        _take_shown_light(state, surfels, seen, found.like_metals)
+
+
+def _take_shown_light(state: State, surfels: Surfels, seen: Seen, like_metals: torch.Tensor) -> None:
+    """Replace the light by what metals show of it (see `shown_light`), if photos agree with that.
+
+    Under a wrong light, base colours are wrong, too. So all metals take base colour and roughness from `like_metals` (N, 4). Paint takes
+    the base colour with which it shows what photos show in the mean.
+    """
+    learned = state.learned
+    metal = (state.surfels().metallic > 0.5).cpu()
+    radiance = shown_light.shown_light(state, surfels, seen, metal, like_metals[:, :3])
+    if radiance is None:
+        return
+    before = shown_light.error(state, state.inputs())
+    kept = {name: learned[name].clone() for name in ("environment", "albedo", "roughness")}
+    which = metal.to(state.device)
+    like = torch.logit(like_metals.clamp(0.02, 0.98)).to(state.device)
+    learned["environment"].copy_(state.method.light.raw(radiance))
+    paint = shown_light.paint_under(radiance, surfels, seen).clamp(0.02, 0.98).to(state.device)
+    learned["albedo"].copy_(torch.where(which[:, None], like[:, :3], torch.logit(paint)))
+    learned["roughness"][which] = like[which, 3]
+    after = shown_light.error(state, state.inputs())
+    state.announce("shown light", f"the light as metals show it: {before:.5f} -> {after:.5f}", detail=True)
+    if after >= before:
+        for name, value in kept.items():
+            learned[name].copy_(value)
+        return
+    for name in kept:
+        learned.forget(name)
 
 
 class Doubt(NamedTuple):
