@@ -1,11 +1,13 @@
 """Test how the light is estimated from what metals show of it, and from what paint receives."""
 
+import math
+
 import pytest
 import torch
 
 from refgs.model.environment import Environment
 from refgs.train.material import metals, mirrored
-from refgs.train.material.shown_light import shown_light
+from refgs.train.material.shown_light import error, shown_light
 from tests.makers.lamps import LAMPS, show
 from tests.makers.training import put
 from tests.makers.training import trainer as small
@@ -57,3 +59,23 @@ def test_paint_tells_how_bright_clipped_lamps_are(made, lamp):
 def test_without_metals_nothing_is_shown(made):
     show(made, metallic=-6.0, roughness=SMOOTH)
     assert shown_by(made, torch.zeros(made.state.learned.count, dtype=torch.bool)) is None
+
+
+def test_the_light_starts_over_where_photos_agree(made):
+    """Check that a wrong light under which silver was learned as dull and dark is replaced, and that the true light is kept."""
+    show(made, metallic=6.0, roughness=SMOOTH, albedo=SILVER, lamp=1.3)
+    state = made.state
+    with torch.no_grad():
+        state.learned["environment"].add_(math.log(EXPOSED))
+    true = state.learned["environment"].detach().clone()
+    like = torch.tensor([0.95, 0.95, 0.95, 0.05]).expand(state.learned.count, 4)
+    surfels, seen, _ = mirrored.fit_both(state)
+    metals._take_shown_light(state, surfels, seen, like)
+    assert torch.equal(state.learned["environment"], true) and "shown light" not in state.decided
+    put(made, roughness=0.5, albedo=torch.full((3,), -1.5))
+    state.learned["environment"].data.fill_(0.0)
+    before = error(state, state.inputs())
+    surfels, seen, _ = mirrored.fit_both(state)
+    metals._take_shown_light(state, surfels, seen, like)
+    assert error(state, state.inputs()) < 0.5 * before and "shown light" in state.decided
+    assert torch.allclose(state.surfels().albedo, like[:, :3], atol=1e-3)

@@ -124,6 +124,7 @@ def judge(state: State, step: Step) -> None:
         _take_shown_light(state, surfels, seen, found.like_metals)
 
 
+@torch.no_grad()
 def _take_shown_light(state: State, surfels: Surfels, seen: Seen, like_metals: torch.Tensor) -> None:
     """Replace the light by what metals show of it (see `shown_light`), if photos agree with that.
 
@@ -144,13 +145,13 @@ def _take_shown_light(state: State, surfels: Surfels, seen: Seen, like_metals: t
     learned["albedo"].copy_(torch.where(which[:, None], like[:, :3], torch.logit(paint)))
     learned["roughness"][which] = like[which, 3]
     after = shown_light.error(state, state.inputs())
-    state.announce("shown light", f"the light as metals show it: {before:.5f} -> {after:.5f}", detail=True)
     if after >= before:
         for name, value in kept.items():
             learned[name].copy_(value)
         return
     for name in kept:
         learned.forget(name)
+    state.announce("shown light", "the light starts over from what metals show of it, as photos agree", detail=True)
 
 
 class Doubt(NamedTuple):

@@ -62,7 +62,8 @@ def shown_light(state: State, surfels: Surfels, seen: Seen, metal: Tensor, refle
     if not known.any():
         return None
     nearest = torch.from_numpy(cKDTree(directions[known].numpy()).query(directions.numpy())[1])
-    room = _low(*(torch.cat(each) for each in zip(*rows, strict=True)), total)[known][nearest]
+    texel, weight, shown = (torch.cat(each) for each in zip(*rows, strict=True))
+    room = _low(texel, weight, shown, total)[known][nearest]
     lamp = _outlines((burnt / (total + burnt))[known][nearest], cubemap.texel_solid_angles(side).float())[:, None]
     dim, lamp = (1 - lamp) * room.clamp_min(DARKEST), lamp.expand(-1, 3)
     return dim + _scale(surfels, seen, metal, dim, lamp) * lamp
