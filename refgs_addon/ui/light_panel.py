@@ -2,7 +2,6 @@
 
 import math
 from pathlib import Path
-from zlib import crc32
 
 import bpy
 from bpy.props import EnumProperty, FloatProperty, StringProperty
@@ -16,30 +15,38 @@ from . import icons
 from .operators import ReportsErrors
 from .panels import Tab
 
-OTHER = 1  # number of a light that is not in the list
-_listed: list[tuple[str, str, str, int, int]] = []  # Blender keeps no references to a dynamic list's strings
+RECOVERED_LIGHT, OTHER = 0, 1  # numbers of the lights that are no files; OTHER is not in the list
+# Numbers of the files, in the order in which they were first listed. Blender's buttons hold an enum's number as a float32, which rounds
+# numbers above 2 ** 24.
+_numbers: dict[str, int] = {}
+_texts: dict[
+    str, str
+] = {}  # all texts ever listed: an open menu points at them, and Blender keeps no references to them
 
 
 def _lights(self, context: bpy.types.Context) -> list[tuple[str, str, str, int, int]]:
-    world = bpy.context.scene.world
+    world, listed = bpy.context.scene.world, []
     shown = world.node_tree.nodes[IMAGE].image if is_panorama(world) else None
-    _listed.clear()
     if is_panorama(world) and world.get(RECOVERED) is not None:
-        recovered = world[RECOVERED]
-        icon = icons.thumbnail(Path(bpy.path.abspath(recovered.filepath)))
-        _listed.append(("RECOVERED", "Recovered", "Light recovered from the photos", icon, 0))
+        icon = icons.thumbnail(Path(bpy.path.abspath(world[RECOVERED].filepath)))
+        listed.append(("RECOVERED", "Recovered", "Light recovered from the photos", icon, RECOVERED_LIGHT))
     files = hdris(hdri_folder())
     for file in files:
-        _listed.append((str(file), file.stem.capitalize(), str(file), icons.thumbnail(file), _number(file)))
+        path, name = _keep(str(file)), _keep(file.stem.capitalize())
+        listed.append((path, name, path, icons.thumbnail(file), _number(file)))
     if _shown(world, files) == OTHER:
-        name = shown.name if shown else "None"
-        _listed.append(("OTHER", name, "Light of the scene", 0, OTHER))
-    return _listed
+        listed.append(("OTHER", _keep(shown.name if shown else "None"), "Light of the scene", 0, OTHER))
+    return listed
+
+
+def _keep(text: str) -> str:
+    """Return the text itself, or an equal one that was listed before. It is never freed."""
+    return _texts.setdefault(text, text)
 
 
 def _number(file: Path) -> int:
-    """Compute a panorama's number in the menu of lights, at least 2, from its path."""
-    return 2 + crc32(str(file).encode()) % (1 << 30)
+    """Return a panorama's number in the menu of lights. It stays the same until Blender closes."""
+    return _numbers.setdefault(str(file), OTHER + 1 + len(_numbers))
 
 
 def _shown(world: bpy.types.World | None, files: list[Path]) -> int:
@@ -47,7 +54,7 @@ def _shown(world: bpy.types.World | None, files: list[Path]) -> int:
     if image is None:
         return OTHER
     if image == world.get(RECOVERED):
-        return 0
+        return RECOVERED_LIGHT
     number = _number(Path(bpy.path.abspath(image.filepath)))
     return number if any(_number(file) == number for file in files) else OTHER
 
@@ -58,10 +65,10 @@ def _get(self) -> int:
 
 def _set(self, number: int) -> None:
     chosen = next((Path(item[0]) for item in _lights(self, bpy.context) if item[4] == number and number > OTHER), None)
-    if chosen is None and number != 0:
+    if chosen is None and number != RECOVERED_LIGHT:
         return
     world = bpy.context.scene.world
-    _, rotation, strength = get_light(world) if is_panorama(world) and number else (None, (0.0, 0.0, 0.0), 1.0)
+    _, rotation, strength = get_light(world) if is_panorama(world) and chosen else (None, (0.0, 0.0, 0.0), 1.0)
     try:
         relight(bpy.context.scene, chosen, rotation[2], strength)
     except InputError as error:

@@ -7,7 +7,6 @@ import bpy
 import numpy as np
 import pytest
 from mathutils import Matrix, Vector
-from scipy.spatial.transform import Rotation
 
 from refgs_addon import jobs
 from refgs_addon.errors import InputError
@@ -19,35 +18,8 @@ from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.regions import REGION
 from refgs_addon.ui.hint_buttons import clicked_ray
 from tests.makers.distances import spread
-from tests.makers.runs import COLUMNS, write_ply
+from tests.makers.still_life import BALL, FAINT, SIDE, write_still_life
 from tests.makers.waiting import final_state, until
-
-BALL, SIDE = 1500, 40  # splats of a ball of radius 1, and along a side of the floor below it, which is 4 wide
-FAINT = 100  # splats in the ball that are nearly transparent
-
-
-def write_still_life(folder):
-    """Write a run folder with a ball that stands on a floor, and a few faint splats in the ball. It says which photos it is of."""
-    ball = spread(BALL)
-    x, y = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(-2, 2, SIDE)]))
-    floor = np.stack([x, y, np.full_like(x, -1.05)], axis=1)
-    faint = 0.9 * spread(FAINT)
-    places = np.concatenate([ball, floor, faint])
-    normals = np.concatenate([ball, np.broadcast_to([0, 0, 1.0], floor.shape), faint / 0.9])
-    turns = [Rotation.align_vectors([normal], [[0, 0, 1]])[0].as_quat(scalar_first=True) for normal in normals]
-    columns = {name: np.full(len(places), 0.5) for name in COLUMNS}
-    columns |= dict(zip(("x", "y", "z"), places.T, strict=True)) | dict(zip(("nx", "ny", "nz"), normals.T, strict=True))
-    columns |= {f"rot_{i}": value for i, value in enumerate(np.array(turns).T)}
-    columns["scale_0"] = columns["scale_1"] = np.full(len(places), np.log(0.06))
-    columns["opacity"] = np.where(np.arange(len(places)) < len(places) - FAINT, 2.0, -3.0)
-    folder.mkdir()
-    write_ply(folder / "splats.ply", columns)
-    (folder / "checkpoints").mkdir()
-    (folder / "checkpoints" / "00000010.toml").touch()
-    photos = folder.parent / "good photos"
-    photos.mkdir()
-    (folder / "run.toml").write_text(f'[run]\ncapture = "{photos.as_posix()}"\n')
-    return folder
 
 
 @pytest.fixture

@@ -74,6 +74,19 @@ def test_blenders_own_and_the_artists_hdris_are_at_hand(scene, tmp_path):
     assert hdris(tmp_path / "not there") == hdris()
 
 
+def test_a_menu_of_lights_outlives_its_list(run_folder, addon, monkeypatch, tmp_path):
+    """Check that a light's number fits the float32 of a button, and that the texts in an open menu are not freed by the next list."""
+    import_run(run_folder, addon)
+    before = light_panel._lights(None, bpy.context)
+    write_panorama(tmp_path / "a room.exr", np.ones((8, 16, 3)))
+    monkeypatch.setattr(light_panel, "hdri_folder", lambda: tmp_path)
+    after = {item[0]: item for item in light_panel._lights(None, bpy.context)}
+    assert len(after) == len(before) + 1 == len({item[4] for item in after.values()})
+    for item in before:
+        assert all(old is new for old, new in zip(item[:3], after[item[0]][:3], strict=True))
+        assert item[4] == after[item[0]][4] == int(np.float32(item[4]))
+
+
 def test_the_chooser_says_and_sets_what_lights_the_scene(run_folder, addon, monkeypatch, tmp_path):
     write_panorama(tmp_path / "my room.exr", np.ones((8, 16, 3)))
     monkeypatch.setattr(light_panel, "hdri_folder", lambda: tmp_path)

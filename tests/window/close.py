@@ -4,17 +4,14 @@ Arguments: the Python with the trainer, the capture, and the letter key that ans
 """
 
 import bpy
-from stage import MODULE, OUT, WORDS, act, install, jobs, photograph, report, write_report
+from stage import MODULE, OUT, WORDS, act, install, jobs, photograph, press, report, write_report
 
 PYTHON, CAPTURE, LETTER = WORDS
 
 
-def press(letter, **held):
+def type_key(key, **held):
     window = bpy.context.window_manager.windows[0]
-    x, y = window.width // 2, window.height // 2
-    window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=x, y=y)
-    for value in ("PRESS", "RELEASE"):
-        window.event_simulate(type=letter, value=value, x=x, y=y, **held)
+    press(key, window.width // 2, window.height // 2, **held)
 
 
 def artist():
@@ -30,19 +27,19 @@ def artist():
     bpy.ops.refgs.train()
     bpy.ops.wm.save_as_mainfile(filepath=str(OUT / "file.blend"))  # otherwise Blender asks to save
     yield lambda: jobs()[-1].progress
-    press("Q", ctrl=True)
+    type_key("Q", ctrl=True)
     yield lambda: True
     photograph("asked")
-    press("C")  # Cancel: its underlined letter
+    type_key("C")  # Cancel: its underlined letter
     yield lambda: True
     iteration = jobs()[-1].progress["iteration"]
     yield lambda: jobs()[-1].progress["iteration"] > iteration
     report["states"] = [jobs()[-1].state]
-    press("Q", ctrl=True)
+    type_key("Q", ctrl=True)
     yield lambda: True
     report["run"] = str(jobs()[-1].run)
     write_report()
-    press(LETTER)
+    type_key(LETTER)
     yield lambda: False
 
 

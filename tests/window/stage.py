@@ -3,6 +3,7 @@
 blender --python-expr "import sys; sys.path.append(FOLDER)" --python SCRIPT.py -- EXTENSION.zip [ARGUMENT ...] OUT
 """
 
+import importlib
 import json
 import shutil
 import subprocess
@@ -25,9 +26,14 @@ def install():
     bpy.ops.extensions.package_install_files(filepath=ARCHIVE, repo="user_default", enable_on_install=True)
 
 
+def addon(name):
+    """Return a module of the add-on, such as "scene.hints"."""
+    return importlib.import_module(f"{MODULE}.refgs_addon.{name}")
+
+
 def jobs():
     """Return the add-on's list of jobs."""
-    return sys.modules[f"{MODULE}.refgs_addon.jobs"].JOBS
+    return addon("jobs").JOBS
 
 
 def area():
@@ -48,6 +54,21 @@ def view():
 def choose_tab():
     region("UI").active_panel_category = "RefGS"
     area().tag_redraw()
+
+
+def click(x, y):
+    """Click with the left mouse button. `x` and `y` count pixels from the lower left corner of the window."""
+    window = bpy.context.window_manager.windows[0]
+    for event, value in (("MOUSEMOVE", "NOTHING"), ("LEFTMOUSE", "PRESS"), ("LEFTMOUSE", "RELEASE")):
+        window.event_simulate(type=event, value=value, x=x, y=y)
+
+
+def press(key, x, y, **held):
+    """Press a key with the mouse at a pixel. `held` are the other keys that are down, such as ctrl=True."""
+    window = bpy.context.window_manager.windows[0]
+    window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=x, y=y)
+    for value in ("PRESS", "RELEASE"):
+        window.event_simulate(type=key, value=value, x=x, y=y, **held)
 
 
 def photograph(name):

@@ -20,6 +20,7 @@ import pytest
 from refgs_addon import jobs
 from tests.makers.films import film_ball
 from tests.makers.runs import write_run
+from tests.makers.still_life import add_mesh_light_and_photos, write_still_life
 from tests.makers.training import TINY
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -76,6 +77,15 @@ def test_the_tab_shows_in_a_window(tmp_path):
     assert report["left"] == []
     picture = cv2.imread(str(tmp_path / "window.png"))
     assert picture.shape[0] > 500 and picture.shape[1] > 800 and picture.std() > 5
+
+
+@pytest.mark.window
+def test_first_clicks(tmp_path):
+    """Check that the buttons that an artist presses first show something, by real clicks and by what the window shows."""
+    run = write_still_life(tmp_path / "still")
+    add_mesh_light_and_photos(run)
+    report = in_window("clicks.py", tmp_path, run)
+    assert Path(report["light"]).parent.name == "world"  # a folder of Blender's HDRIs
 
 
 @pytest.mark.window

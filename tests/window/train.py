@@ -14,8 +14,10 @@ from stage import (
     OUT,
     PATIENCE,
     WORDS,
+    addon,
     area,
     choose_tab,
+    click,
     install,
     jobs,
     photograph,
@@ -122,10 +124,8 @@ def use_result(folder):
 
 def click_middle():
     """Click in the middle of the 3D view, where a photo's camera sees the object."""
-    window, middle = bpy.context.window_manager.windows[0], region("WINDOW")
-    x, y = middle.x + middle.width // 2, middle.y + middle.height // 2
-    for event, value in (("MOUSEMOVE", "NOTHING"), ("LEFTMOUSE", "PRESS"), ("LEFTMOUSE", "RELEASE")):
-        window.event_simulate(type=event, value=value, x=x, y=y)
+    middle = region("WINDOW")
+    click(middle.x + middle.width // 2, middle.y + middle.height // 2)
 
 
 ours = 0.0  # seconds: longest wait of the window for the add-on since the last step
@@ -164,10 +164,6 @@ def measured_draw(draw):
 
 def numpy():
     return importlib.util.find_spec("numpy") is not None
-
-
-def addon(name):
-    return importlib.import_module(f"{MODULE}.refgs_addon.{name}")
 
 
 steps, waiting, due, longest = artist(), None, time.perf_counter() + 3.0, 0.0

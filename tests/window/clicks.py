@@ -1,0 +1,46 @@
+"""Click as an artist does who sees a run for the first time, and report what the clicks did.
+
+Its argument is the run folder. stage.py shows the command line.
+"""
+
+import bpy
+from stage import WORDS, act, addon, after, area, choose_tab, click, install, photograph, region, report
+
+(RUN,) = WORDS
+
+
+def artist():
+    """Install the extension, import a run, and click. Each `yield` gives a function; the next step waits until it returns true."""
+    install()
+    bpy.ops.object.select_all(action="SELECT")
+    bpy.ops.object.delete()
+    bpy.ops.refgs.import_run(directory=RUN)
+    area().spaces.active.show_region_ui = True
+    yield after(2.0)
+    choose_tab()
+    yield from choose_light()
+
+
+def choose_light():
+    """Click on the light's picture, then on a picture in the menu that opens below it."""
+    panels = [cls for cls in addon("ui").CLASSES if issubclass(cls, bpy.types.Panel)]
+    for cls in panels:
+        if cls.__name__ != "LightPanel":  # the only panel's place in the sidebar is known
+            bpy.utils.unregister_class(cls)
+    area().tag_redraw()
+    yield after(3.0)
+    sidebar = region("UI")
+    middle, top = sidebar.x + sidebar.width // 2, sidebar.y + sidebar.height
+    click(middle, top - 90)
+    yield after(3.0)
+    photograph("lights")
+    click(middle - 212, top - 225)
+    yield after(2.0)
+    photograph("lit")
+    report["light"] = bpy.context.scene.world.node_tree.nodes["RefGS HDRI"].image.filepath
+    for cls in panels:
+        if cls.__name__ != "LightPanel":
+            bpy.utils.register_class(cls)
+
+
+act(artist())
