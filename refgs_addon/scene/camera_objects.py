@@ -99,6 +99,9 @@ def frame_camera(scene: bpy.types.Scene, camera: bpy.types.Object, size: int | N
 def show_photo(camera: bpy.types.Object, amount: float = 1.0) -> None:
     """Lay a camera's photo over its view with the opacity `amount`; 0 hides the photo. The first call loads the photo.
 
+    Blender draws a photo only if its camera is visible, and the collection of a run's cameras is hidden. So the camera is also linked to
+    the scene's own collection while its photo is shown.
+
     Raises InputError where the camera has no photo, or the photo's file is missing.
     """
     data = camera.data
@@ -116,6 +119,16 @@ def show_photo(camera: bpy.types.Object, amount: float = 1.0) -> None:
     data.show_background_images = amount > 0
     if amount > 0:
         data.background_images[0].alpha = amount
+    for scene in camera.users_scene:
+        own = scene.collection.objects
+        if amount > 0:
+            camera.hide_viewport = False
+            if camera.name not in own:
+                own.link(camera)
+            for layer in scene.view_layers:
+                camera.hide_set(False, view_layer=layer)
+        elif camera.name in own and len(camera.users_collection) > 1:
+            own.unlink(camera)
 
 
 def photo_shown(camera: bpy.types.Object | None) -> float:

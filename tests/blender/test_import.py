@@ -367,6 +367,26 @@ def test_photos_lie_over_what_their_cameras_see(run_folder, scene, tmp_path):
     assert len(front.data.background_images) == 1 and photo_shown(front) == 1
 
 
+def test_the_camera_of_a_photo_is_visible(run_folder, scene, tmp_path):
+    """Check that Blender can draw a photo, which it does for visible cameras only. A run's cameras are hidden."""
+    with_photos(run_folder, tmp_path / "photos")
+    run = import_run(run_folder, scene)
+    front, shifted = run.cameras.values()
+    front.hide_set(True)
+    show_photo(front, 0.5)
+    assert (front.visible_get(), shifted.visible_get()) == (True, False)
+    assert next_camera(scene, run.collection) == shifted
+    assert (front.visible_get(), shifted.visible_get()) == (False, True)
+    show_photo(shifted, 0)
+    assert not shifted.visible_get() and [*cameras(run.collection).objects] == [front, shifted]
+    shifted.hide_viewport, cameras(run.collection).hide_viewport = False, False
+    scene.collection.objects.link(shifted)
+    cameras(run.collection).objects.unlink(shifted)  # moved by the artist
+    show_photo(shifted)
+    show_photo(shifted, 0)
+    assert shifted.name in scene.objects
+
+
 def test_a_photo_that_is_gone_is_said_in_one_line(run, run_folder, scene, tmp_path):
     with pytest.raises(InputError, match="front has no photo"):
         show_photo(run.cameras["front"])

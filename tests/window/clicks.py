@@ -4,7 +4,7 @@ Its argument is the run folder. stage.py shows the command line.
 """
 
 import bpy
-from stage import WORDS, act, addon, after, area, choose_tab, click, install, photograph, region, report
+from stage import WORDS, act, addon, after, area, choose_tab, click, install, photograph, region, report, view
 
 (RUN,) = WORDS
 
@@ -19,6 +19,7 @@ def artist():
     yield after(2.0)
     choose_tab()
     yield from choose_light()
+    yield from show_photos()
 
 
 def choose_light():
@@ -41,6 +42,23 @@ def choose_light():
     for cls in panels:
         if cls.__name__ != "LightPanel":
             bpy.utils.register_class(cls)
+
+
+def show_photos():
+    """Lay a photo over its camera's view, and step to the next camera."""
+    with view():
+        bpy.ops.refgs.photo()
+    yield after(3.0)
+    photograph("left")
+    with view():
+        bpy.ops.refgs.next_camera()
+    yield after(3.0)
+    photograph("right")
+    with view():
+        bpy.ops.refgs.photo()
+        bpy.ops.view3d.view_camera()  # back
+    yield after(3.0)
+    photograph("no photo")
 
 
 act(artist())

@@ -15,12 +15,13 @@ import time
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from refgs_addon import jobs
 from tests.makers.films import film_ball
 from tests.makers.runs import write_run
-from tests.makers.still_life import add_mesh_light_and_photos, write_still_life
+from tests.makers.still_life import PHOTOS, add_mesh_light_and_photos, write_still_life
 from tests.makers.training import TINY
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -41,6 +42,11 @@ def blender_command():
     if not shutil.which("xvfb-run"):
         pytest.skip("no Blender window: neither a DISPLAY nor xvfb-run")
     return ["xvfb-run", "-a", "-s", "-screen 0 1600x1000x24", "blender", "-p", "0", "0", "1600", "1000"]
+
+
+def covered(file, color):
+    """Return the part of a screenshot's pixels that nearly have a colour (BGR)."""
+    return float((np.abs(cv2.imread(str(file)).astype(int) - color).max(axis=2) < 60).mean())
 
 
 def in_window(script, tmp_path, *words):
@@ -86,6 +92,8 @@ def test_first_clicks(tmp_path):
     add_mesh_light_and_photos(run)
     report = in_window("clicks.py", tmp_path, run)
     assert Path(report["light"]).parent.name == "world"  # a folder of Blender's HDRIs
+    for name in ("left", "right"):
+        assert covered(tmp_path / f"{name}.png", PHOTOS[name]) > 0.05 > covered(tmp_path / "no photo.png", PHOTOS[name])
 
 
 @pytest.mark.window
