@@ -24,6 +24,7 @@ from .world_diffuse import surface_inputs
 
 NAME = "RefGS Edit"  # the tree; its modifiers' names begin with it
 MESH_EDITS = "RefGS Follow"  # the mesh's tree and modifier
+FALLOFF = 0.2  # of a new edit: the width of its soft border, as a fraction of the region
 REGIONS = ("Everywhere", "Box", "Sphere", "Similar", "Painted")
 # Result of the edits so far at a point, as premultiplied values and alpha: COLOR and SURFACE (metallic, roughness) are multiplied by
 # AMOUNT (of colour, metallic, roughness).
@@ -53,7 +54,7 @@ def edit_tree() -> bpy.types.NodeTree:
     add_input(tree, "Painted", "String", "Painted vertex group of the region")
     add_input(tree, "Base Color", "Color", "New base colour", default_value=from_rec709((1.0, 0.77, 0.34, 1.0)))
     for name, value, description in (
-        ("Falloff", 0.2, "Width of the soft border, as a fraction of the region"),
+        ("Falloff", FALLOFF, "Width of the soft border, as a fraction of the region"),
         ("Tolerance", 0.2, "Largest difference from the material at the region that is still edited"),
         ("Color Amount", 1.0, "Amount of the base colour to replace"),
         ("Metallic", 1.0, "New metallic"),

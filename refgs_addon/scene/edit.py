@@ -1,16 +1,20 @@
 """Edit the splats' materials. Each edit is a modifier, which the artist can change, switch off, move or remove at any time."""
 
 import bpy
+from mathutils import Vector
 
 from .. import compat
 from ..errors import InputError
-from ..nodes.edit_tree import MESH_EDITS, NAME, REGIONS, add_edits_to_material, edit_tree, mesh_edits_tree
+from ..nodes.edit_tree import FALLOFF, MESH_EDITS, NAME, REGIONS, add_edits_to_material, edit_tree, mesh_edits_tree
 from ..nodes.splat_material import connect_edits
 from ..nodes.splats_tree import NAME as SPLATS
 from .deleted_splats import count_deleted
 from .material_presets import read_material, set_inputs
-from .regions import REGION, add_region
+from .regions import REGION, add_region, bounds
 from .run_parts import parts, stand_with
+
+FIRST = 0.1  # of the splats, that a new box or ball changes fully
+SOLID = 0.5  # opacity of splats that count as the surface
 
 
 def add_edit(
@@ -19,7 +23,7 @@ def add_edit(
     """Add an edit after the earlier edits of a run. An edit is a modifier that changes the splats' materials. The mesh shows the edit too.
 
     `collection` is the collection of the run. `where` selects the splats, as in `nodes.edit_tree`: "Everywhere", "Box", "Sphere", "Similar"
-    or "Painted". "Box", "Sphere" and "Similar" get an Empty in the middle of the splats, which the artist moves, rotates and scales.
+    or "Painted". "Box", "Sphere" and "Similar" get an Empty, which the artist moves, rotates and scales.
     "Painted" gets an object with the shape of the mesh, on which the artist paints. `material` is the name of a material preset.
 
     Raises InputError if the collection has no splats, or if the preset is missing or invalid. "Painted" also needs a mesh.
@@ -79,11 +83,32 @@ def splats_of(collection: bpy.types.Collection) -> bpy.types.Object:
 
 
 def _region(splats: bpy.types.Object, collection: bpy.types.Collection, where: str) -> bpy.types.Object:
-    """Add an Empty in the middle of the splats that marks where an edit applies."""
+    """Add an Empty that marks where an edit applies.
+
+    A new box or ball reaches from the middle of the splats to the surface, so that it changes something at once. The axes of "Similar"
+    stand on the surface.
+    """
     shape = {"Box": "CUBE", "Sphere": "SPHERE", "Similar": "ARROWS"}[where]
     region = add_region(splats, collection, f"{where} of {splats.name}", shape)
-    region.scale = [max(region.scale) * (1 / 6 if where == "Similar" else 1 / 3)] * 3
+    side, (low, high) = max(region.scale), bounds(splats.data)
+    middle = (low + high) / 2
+    apart = [place - middle for place in _solid_places(splats.data)] or [high - middle]
+    if where == "Similar":
+        region.location = splats.matrix_basis @ (middle + min(apart, key=lambda line: line.length))
+        region.scale = [side / 6] * 3
+        return region
+    reach = sorted(line.length if where == "Sphere" else max(map(abs, line)) for line in apart)
+    region.scale = [max(side / 3, reach[int(FIRST * (len(reach) - 1))] / (1 - FALLOFF))] * 3
     return region
+
+
+def _solid_places(cloud: bpy.types.PointCloud) -> list[Vector]:
+    """Return the positions of the splats that are not nearly transparent."""
+    places, opacities = [0.0] * (3 * len(cloud.points)), [0.0] * len(cloud.points)
+    cloud.attributes["position"].data.foreach_get("vector", places)
+    cloud.attributes["opacity"].data.foreach_get("value", opacities)
+    rows = zip(zip(*[iter(places)] * 3, strict=True), opacities, strict=True)
+    return [Vector(place) for place, opacity in rows if opacity >= SOLID]
 
 
 def _paint_target(mesh: bpy.types.Object, collection: bpy.types.Collection) -> tuple[bpy.types.Object, str]:

@@ -21,10 +21,10 @@ REGION = "refgs_region"  # custom property of an object that marks a region
 def add_region(splats: bpy.types.Object, collection: bpy.types.Collection, name: str, shape: str) -> bpy.types.Object:
     """Add an Empty around the splats. In the Empty's local coordinates, nearly all splats lie in the cube from -1 to 1.
 
-    `shape` is how Blender displays the Empty: "CUBE", "SPHERE" or "ARROWS".
+    `shape` is how Blender displays the Empty: "CUBE", "SPHERE" or "ARROWS". It is drawn in front of the object that surrounds it.
     """
     region = bpy.data.objects.new(name, None)
-    region[REGION] = True
+    region[REGION] = region.show_in_front = True
     region.empty_display_type = shape
     low, high = bounds(splats.data)
     region.parent, region.matrix_parent_inverse = splats.parent, splats.matrix_parent_inverse

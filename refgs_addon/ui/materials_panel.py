@@ -62,6 +62,7 @@ class AddEdit(OnRun, bpy.types.Operator):
         region = compat.get_modifier_input(edit, "Region")
         if region is not None:
             select_only(context, region)
+        show_materials(context)
         if self.where == "Painted" and context.area is not None:
             bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
 

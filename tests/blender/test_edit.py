@@ -14,6 +14,7 @@ from refgs_addon.scene.material_presets import set_material
 from refgs_addon.scene.regions import crop
 from refgs_addon.scene.run_parts import show
 from tests.makers.blender import attribute, evaluated_mesh
+from tests.makers.still_life import write_still_life
 
 GOLD = (1.0, 0.766, 0.336), 1.0, 0.15  # base colour, metallic, roughness
 CHROME_ROUGHNESS = 0.02
@@ -74,6 +75,20 @@ def test_a_region_is_moved_turned_and_scaled(run, where, size):
     # Splats and region that move together keep the edit.
     run.splats.location.x, region.location = 5.0, (5.3, -0.2, 0.1)
     np.testing.assert_allclose(drawn(run, "roughness"), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("where", ["Box", "Sphere", "Similar"])
+def test_a_new_region_is_seen_and_changes_something(scene, tmp_path, where):
+    """Check that a new region is drawn in front of the object that it is in, and reaches the surface of a hollow object."""
+    run = import_run(write_still_life(tmp_path / "still"), scene)
+    show(run.collection, "splats")
+    region = compat.get_modifier_input(add_edit(run.collection, where, "Gold"), "Region")
+    assert region.show_in_front
+    changed = (drawn(run, "metallic") > 0.99).mean()
+    assert changed > 0.09 and (where == "Similar" or changed < 0.7)
+    if where == "Similar":
+        apart = learned(run, "position") - np.array(region.matrix_basis.translation)
+        assert np.linalg.norm(apart, axis=1).min() < 1e-5
 
 
 def test_the_border_is_soft(run):

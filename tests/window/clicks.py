@@ -20,6 +20,7 @@ def artist():
     choose_tab()
     yield from choose_light()
     yield from show_photos()
+    yield from edit_regions()
 
 
 def choose_light():
@@ -39,6 +40,7 @@ def choose_light():
     yield after(2.0)
     photograph("lit")
     report["light"] = bpy.context.scene.world.node_tree.nodes["RefGS HDRI"].image.filepath
+    bpy.ops.refgs.recovered_light()
     for cls in panels:
         if cls.__name__ != "LightPanel":
             bpy.utils.register_class(cls)
@@ -59,6 +61,22 @@ def show_photos():
         bpy.ops.view3d.view_camera()  # back
     yield after(3.0)
     photograph("no photo")
+
+
+def edit_regions():
+    """Edit the material in a box, in a ball, and where it is similar. The view is Solid before each."""
+    report["edited"] = {}
+    for where in ("Box", "Sphere", "Similar"):
+        area().spaces.active.shading.type = "SOLID"
+        with view():
+            bpy.ops.refgs.add_edit(where=where)
+        region = bpy.context.view_layer.objects.active
+        report["edited"][where] = area().spaces.active.shading.type, region.name
+        yield after(12.0)  # to compile shaders
+        photograph(where)
+        splats = bpy.data.objects["still splats"]
+        bpy.ops.refgs.remove_edit(splats=splats.name, edit=addon("scene.edit").edits(splats)[0].name)
+        yield after(1.0)
 
 
 act(artist())

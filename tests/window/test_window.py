@@ -49,6 +49,12 @@ def covered(file, color):
     return float((np.abs(cv2.imread(str(file)).astype(int) - color).max(axis=2) < 60).mean())
 
 
+def golden(file):
+    """Return the part of a screenshot's pixels that are yellow: far more red than blue, and green between."""
+    blue, green, red = np.moveaxis(cv2.imread(str(file)).astype(int), 2, 0)
+    return float(((red > blue + 40) & (green > blue + 15) & (red > green)).mean())
+
+
 def in_window(script, tmp_path, *words):
     """Build the extension, and run a script with it in a Blender window. Returns the script's report.
 
@@ -94,6 +100,9 @@ def test_first_clicks(tmp_path):
     assert Path(report["light"]).parent.name == "world"  # a folder of Blender's HDRIs
     for name in ("left", "right"):
         assert covered(tmp_path / f"{name}.png", PHOTOS[name]) > 0.05 > covered(tmp_path / "no photo.png", PHOTOS[name])
+    for where, (shading, active) in report["edited"].items():
+        assert shading == "MATERIAL" and active == f"{where} of still splats"
+        assert golden(tmp_path / f"{where}.png") > 0.01
 
 
 @pytest.mark.window
