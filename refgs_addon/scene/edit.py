@@ -114,7 +114,8 @@ def _solid_places(cloud: bpy.types.PointCloud) -> list[Vector]:
 def _paint_target(mesh: bpy.types.Object, collection: bpy.types.Collection) -> tuple[bpy.types.Object, str]:
     """Return an object to paint on, and the name of its new vertex group.
 
-    It shares the mesh's data, but has no modifiers: those of the mesh depend on the painted weights, which would make a cycle.
+    It shares the mesh's data, but has no modifiers: those of the mesh depend on the painted weights, which would make a cycle. It shows the
+    weights while the artist paints, and is invisible otherwise: it would cover the edited mesh or splats.
     """
     found = [item for item in collection.objects if item.get(REGION) and item.data == mesh.data]
     if found:
@@ -122,6 +123,8 @@ def _paint_target(mesh: bpy.types.Object, collection: bpy.types.Collection) -> t
     else:
         canvas = bpy.data.objects.new(f"{mesh.name} to paint on", mesh.data)
         canvas[REGION] = canvas.hide_render = True
+        for ray in ("camera", "diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
+            setattr(canvas, f"visible_{ray}", False)
         stand_with(canvas, mesh)
         collection.objects.link(canvas)
     group = canvas.vertex_groups.new(name="RefGS Painted")

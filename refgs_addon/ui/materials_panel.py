@@ -7,6 +7,7 @@ from bl_ui.utils import PresetPanel
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from .. import compat
+from ..errors import InputError
 from ..nodes.edit_tree import REGIONS
 from ..preferences import wrapped_text
 from ..scene.doubt import doubt_shown, doubt_words, has_doubt, show_doubt
@@ -84,6 +85,25 @@ class RemoveEdit(_OfEdit, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         remove_edit(bpy.data.objects[self.splats], self.edit)
+
+
+class PaintEdit(_OfEdit, bpy.types.Operator):
+    bl_idname = "refgs.paint_edit"
+    bl_label = "Paint"
+    bl_description = "Paint where this edit applies. Splats and Mesh in the panel Run end it, and show the result"
+
+    def work(self, context: bpy.types.Context) -> None:
+        edit = self.modifier()
+        canvas = compat.get_modifier_input(edit, "Region")
+        if canvas is None or canvas.name not in context.view_layer.objects:
+            raise InputError(f"the object to paint on of {edit.name} was deleted: remove the edit and add another one")
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        select_only(context, canvas)
+        group = canvas.vertex_groups.get(compat.get_modifier_input(edit, "Painted"))
+        if group is not None:
+            canvas.vertex_groups.active = group
+        bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
 
 
 class SetMaterial(_OfEdit, bpy.types.Operator):
@@ -199,6 +219,9 @@ class MaterialPanel(Tab, bpy.types.Panel):
         column = box.column()
         column.use_property_split, column.use_property_decorate = True, False
         where = compat.get_modifier_input(edit, "Where")
+        if where == "Painted":
+            button = column.operator(PaintEdit.bl_idname, icon="BRUSH_DATA")
+            button.splats, button.edit = edit.id_data.name, edit.name
         names = ["Where"] + ([] if where == "Everywhere" else ["Region", "Falloff"])
         for name in names + (["Tolerance"] if where == "Similar" else []):
             self._input(column, edit, name, name)
@@ -219,7 +242,7 @@ class MaterialPanel(Tab, bpy.types.Panel):
             layout.prop(owner, path, text=text)
 
 
-CLASSES = (ShowDoubt, AddEdit, RemoveEdit, SetMaterial, KeepMaterial, MaterialPresets, MaterialPanel)
+CLASSES = (ShowDoubt, AddEdit, RemoveEdit, PaintEdit, SetMaterial, KeepMaterial, MaterialPresets, MaterialPanel)
 
 
 def register() -> None:

@@ -149,6 +149,8 @@ class ShowPart(ReportsErrors, bpy.types.Operator):
     part: EnumProperty(name="Part", items=[("splats", "Splats", ""), ("mesh", "Mesh", "")])
 
     def work(self, context: bpy.types.Context) -> None:
+        if context.mode == "PAINT_WEIGHT":  # whose colours would cover the part
+            bpy.ops.object.mode_set(mode="OBJECT")
         show(bpy.data.collections[self.collection], self.part)
 
 

@@ -194,6 +194,22 @@ def test_what_is_painted_on_the_mesh(run):
     assert not [item for item in run.collection.objects if item.get("refgs_region")]
 
 
+def test_the_painted_object_covers_nothing(addon, run):
+    """Check that the object to paint on is invisible after painting, and that a click on a part of the run ends painting."""
+    first, second = (add_edit(run.collection, "Painted", name) for name in ("Gold", "Rubber"))
+    canvas = compat.get_modifier_input(first, "Region")
+    assert not any(getattr(canvas, f"visible_{ray}") for ray in ("camera", "diffuse", "glossy", "shadow"))
+    for edit in (first, second):
+        bpy.ops.refgs.paint_edit(splats=run.splats.name, edit=edit.name)
+        assert bpy.context.mode == "PAINT_WEIGHT" and bpy.context.view_layer.objects.active == canvas
+        assert canvas.vertex_groups.active.name == compat.get_modifier_input(edit, "Painted")
+    bpy.ops.refgs.show(collection=run.collection.name, part="splats")
+    assert bpy.context.mode == "OBJECT"
+    bpy.data.objects.remove(canvas)
+    with pytest.raises(RuntimeError, match="was deleted: remove the edit"):
+        bpy.ops.refgs.paint_edit(splats=run.splats.name, edit=first.name)
+
+
 def test_painting_needs_a_mesh(run_folder, scene):
     (run_folder / "mesh.glb").unlink()
     run = import_run(run_folder, scene)

@@ -21,6 +21,7 @@ def artist():
     yield from choose_light()
     yield from show_photos()
     yield from edit_regions()
+    yield from paint()
 
 
 def choose_light():
@@ -77,6 +78,24 @@ def edit_regions():
         splats = bpy.data.objects["still splats"]
         bpy.ops.refgs.remove_edit(splats=splats.name, edit=addon("scene.edit").edits(splats)[0].name)
         yield after(1.0)
+
+
+def paint():
+    """Paint the whole mesh, then show the splats and the mesh."""
+    with view():
+        bpy.ops.refgs.add_edit(where="Painted")
+    canvas = bpy.context.view_layer.objects.active
+    report["painting"] = bpy.context.mode
+    canvas.vertex_groups.active.add(range(len(canvas.data.vertices)), 1.0, "REPLACE")
+    for part in ("splats", "mesh"):
+        with view():
+            bpy.ops.refgs.show(collection="RefGS still", part=part)
+        yield after(8.0)
+        photograph(f"painted {part}")
+    bpy.ops.refgs.remove_edit(
+        splats="still splats", edit=addon("scene.edit").edits(bpy.data.objects["still splats"])[0].name
+    )
+    yield after(1.0)
 
 
 act(artist())

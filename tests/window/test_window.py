@@ -103,6 +103,9 @@ def test_first_clicks(tmp_path):
     for where, (shading, active) in report["edited"].items():
         assert shading == "MATERIAL" and active == f"{where} of still splats"
         assert golden(tmp_path / f"{where}.png") > 0.01
+    assert report["painting"] == "PAINT_WEIGHT"
+    for part in ("splats", "mesh"):
+        assert golden(tmp_path / f"painted {part}.png") > 0.05
 
 
 @pytest.mark.window
