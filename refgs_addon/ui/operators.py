@@ -102,8 +102,7 @@ def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, 
     operator.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats{where}")
     splats = shown(run.collection) == "splats"
     select_only(context, run.splats if splats else run.mesh[0])
-    if splats:
-        show_materials(context)
+    show_materials(context, ("SOLID",))
     frame_selected(context)
     if run.left_out:
         operator.report({"WARNING"}, f"{run.left_out:,} splats with values that are not finite were left out")
@@ -152,6 +151,8 @@ class ShowPart(ReportsErrors, bpy.types.Operator):
         if context.mode == "PAINT_WEIGHT":  # whose colours would cover the part
             bpy.ops.object.mode_set(mode="OBJECT")
         show(bpy.data.collections[self.collection], self.part)
+        if self.part == "splats":  # in Solid, they are grey shards, and the mesh covers them
+            show_materials(context, ("SOLID",))
 
 
 class SetDetail(ReportsErrors, bpy.types.Operator):
@@ -215,13 +216,14 @@ class RestoreSplats(_Deletes, bpy.types.Operator):
         restore(self.found(context))
 
 
-def show_materials(context: bpy.types.Context) -> None:
-    """Switch 3D views from Solid or Wireframe to Material Preview, lit by the scene's world."""
-    for area in context.screen.areas if context.screen else ():
-        if area.type == "VIEW_3D":
-            shading = area.spaces.active.shading
-            if shading.type in ("SOLID", "WIREFRAME"):
-                shading.type, shading.use_scene_world = "MATERIAL", True
+def show_materials(context: bpy.types.Context, instead_of: tuple[str, ...] = ("SOLID", "WIREFRAME")) -> None:
+    """Switch the 3D views of all windows to Material Preview, lit by the scene's world, if they show one of the shadings `instead_of`."""
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                shading = area.spaces.active.shading
+                if shading.type in instead_of:
+                    shading.type, shading.use_scene_world = "MATERIAL", True
 
 
 def frame_selected(context: bpy.types.Context) -> None:

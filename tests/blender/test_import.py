@@ -519,6 +519,23 @@ def test_a_run_stands_beside_what_was_in_its_place(run_folder, addon):
     np.testing.assert_allclose(box(again.mesh[0])[0], [0.9, -3.3, 1.8], atol=1e-5)
 
 
+@pytest.mark.parametrize("meshes", [True, False])
+def test_a_solid_view_shows_the_materials_of_what_is_imported(run_folder, addon, meshes):
+    """Check that import switches Solid views to Material Preview and leaves others, and that so does the button of the splats."""
+    if not meshes:
+        (run_folder / "mesh.glb").unlink()
+    (area,) = (area for area in bpy.context.screen.areas if area.type == "VIEW_3D")
+    shading = area.spaces.active.shading
+    for before, after in (("SOLID", "MATERIAL"), ("RENDERED", "RENDERED"), ("WIREFRAME", "WIREFRAME")):
+        shading.type = before
+        bpy.ops.refgs.import_run(directory=str(run_folder))
+        assert shading.type == after and (before != "SOLID" or shading.use_scene_world)
+    for part, after in (("mesh", "SOLID"), ("splats", "MATERIAL")):
+        shading.type = "SOLID"
+        bpy.ops.refgs.show(collection="RefGS pot", part=part)
+        assert shading.type == after
+
+
 def test_eevee_traces_rays_as_the_artist_wants(run_folder, scene):
     import_run(run_folder, scene)
     assert scene.eevee.use_raytracing and scene.eevee.ray_tracing_options.resolution_scale == "1"

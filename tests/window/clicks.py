@@ -18,6 +18,9 @@ def artist():
     area().spaces.active.show_region_ui = True
     yield after(2.0)
     choose_tab()
+    report["imported"] = area().spaces.active.shading.type
+    yield after(15.0)  # to compile shaders
+    photograph("imported")
     yield from choose_light()
     yield from show_photos()
     yield from edit_regions()
@@ -73,7 +76,7 @@ def edit_regions():
             bpy.ops.refgs.add_edit(where=where)
         region = bpy.context.view_layer.objects.active
         report["edited"][where] = area().spaces.active.shading.type, region.name
-        yield after(12.0)  # to compile shaders
+        yield after(8.0)
         photograph(where)
         splats = bpy.data.objects["still splats"]
         bpy.ops.refgs.remove_edit(splats=splats.name, edit=addon("scene.edit").edits(splats)[0].name)

@@ -97,6 +97,7 @@ def test_first_clicks(tmp_path):
     run = write_still_life(tmp_path / "still")
     add_mesh_light_and_photos(run)
     report = in_window("clicks.py", tmp_path, run)
+    assert report["imported"] == "MATERIAL"
     assert Path(report["light"]).parent.name == "world"  # a folder of Blender's HDRIs
     for name in ("left", "right"):
         assert covered(tmp_path / f"{name}.png", PHOTOS[name]) > 0.05 > covered(tmp_path / "no photo.png", PHOTOS[name])
