@@ -4,6 +4,8 @@ The trainer keeps the hinted splats metal or paint when it trains again.
 """
 
 import json
+from collections.abc import Iterable
+from functools import cached_property
 from pathlib import Path
 
 import bpy
@@ -23,6 +25,9 @@ SOLID = 0.2  # opacity of splats that make up a surface; fainter ones belong to 
 NEIGHBOURS = 13  # the splat itself is among them
 MOST = 0.6  # of a splat's neighbours that are in a part, above which it belongs there, whatever its normal
 BEND = np.cos(np.radians(15))  # of the normals of two neighbours on a smooth surface; at a crease they differ more
+LIFT = (
+    0.004  # of the highlight above the surface, as a part of the run's longest side: the mesh may lie above the splats
+)
 STEP = 0.35  # sine of the angle between a smooth surface and the line to a neighbour on it
 
 
@@ -57,11 +62,98 @@ def part_at(splats: bpy.types.Object, origin: Vector, direction: Vector) -> np.n
     A part is a piece of the surface without creases. Changes of the trained material do not end a part, because that material may be wrong.
     `origin` and `direction` of the ray are in world space. Raises InputError if the ray hits no splat.
     """
-    inverse = _to_world(splats).inverted_safe()
-    seed = _hit(splats, np.array(inverse @ origin), np.array(inverse.to_3x3() @ direction))
+    surface = Surface(splats)
+    seed = surface.hit(origin, direction)
     if seed is None:
         raise InputError("no splat is under the cursor: click on the part")
-    return _attribute(splats, "position", "vector", 3)[_smooth_part(splats, seed)]
+    return surface.position[surface.smooth_part(seed)]
+
+
+class Surface:
+    """Hold the splats of a run, read once, to find the parts under a mouse that moves."""
+
+    def __init__(self, splats: bpy.types.Object):
+        self._matrix = _to_world(splats)
+        self.position, self._scale, self._normal = (
+            _attribute(splats, name, "vector", 3) for name in ("position", "scale", "normal")
+        )
+        self._opacity = _attribute(splats, "opacity", "value", 1)[:, 0]
+        self._axes = splat_axes(_attribute(splats, "rotation", "value", 4))
+
+    def hit(self, origin: Vector, direction: Vector) -> int | None:
+        """Return the index of the splat that a ray in world space hits first, or None."""
+        inverse = self._matrix.inverted_safe()
+        start, along = np.array(inverse @ origin), np.array(inverse.to_3x3() @ direction)
+        normal, towards = np.cross(*self._axes), self.position - start
+        slope = normal @ along
+        distance = np.einsum("na,na->n", normal, towards) / np.where(np.abs(slope) < 1e-9, np.inf, slope)
+        offset = distance[:, None] * along - towards
+        u, v = (np.einsum("na,na->n", offset, axis) / self._scale[:, i] for i, axis in enumerate(self._axes))
+        alpha = self._opacity * np.exp(-0.5 * (u * u + v * v)) * (distance > 0)
+        hit = np.flatnonzero(alpha > 1 / 255)
+        if not len(hit):
+            return None
+        hit = hit[np.argsort(distance[hit])]
+        through = np.cumprod(1 - alpha[hit])
+        return int(hit[min(np.searchsorted(-through, -HALF), len(hit) - 1)])
+
+    def smooth_part(self, seed: int) -> np.ndarray:
+        """Return a mask (N,) of the splats that a crease-free surface connects to the `seed`."""
+        solid, near, owner = self._neighbours
+        seed = owner[seed]
+        part = np.arange(len(self.position)) == seed
+        front = np.array([seed])
+        while len(front):
+            pairs = np.repeat(front, near.shape[1]), near[front].ravel()
+            line = self.position[pairs[1]] - self.position[pairs[0]]
+            line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-12)
+            lifted = np.maximum(*(np.abs(np.einsum("na,na->n", self._normal[ends], line)) for ends in pairs))
+            smooth = np.einsum("na,na->n", *(self._normal[ends] for ends in pairs)) > BEND
+            front = np.unique(pairs[1][smooth & (lifted < STEP) & ~part[pairs[1]]])
+            part[front] = True
+        while (gaps := solid & ~part & (part[near].mean(axis=1) > MOST)).any():
+            part |= gaps
+        return part[owner]
+
+    def nearest(self, points: np.ndarray) -> np.ndarray:
+        """Return a mask (N,) of the splats nearest to the `points` (P, 3)."""
+        tree, part = _tree(self.position, range(len(self.position))), np.zeros(len(self.position), bool)
+        part[[tree.find(point)[1] for point in points]] = True
+        return part
+
+    def corners(self, part: np.ndarray) -> np.ndarray:
+        """Return the corners (P, 4, 3) of the splats in `part`, a mask (N,), in world space. They lie a little above the surface."""
+        u, v = (axis[part] * self._scale[part, i, None] for i, axis in enumerate(self._axes))
+        centre = self.position[part] + LIFT * np.ptp(self.position, axis=0).max() * self._normal[part]
+        matrix = np.array(self._matrix)
+        return (
+            np.stack([centre - u - v, centre + u - v, centre + u + v, centre - u + v], 1) @ matrix[:3, :3].T
+            + matrix[:3, 3]
+        )
+
+    @cached_property
+    def _neighbours(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the mask (N,) of solid splats, the indices (N, K) of their neighbours, and of each splat's nearest solid one (N,)."""
+        solid = self._opacity >= SOLID
+        if not solid.any():
+            solid[:] = True
+        rows, owner = np.flatnonzero(solid), np.arange(len(solid))
+        tree = _tree(self.position, rows)
+        near = np.zeros((len(solid), min(NEIGHBOURS, len(rows))), int)
+        near[rows] = [[other for _, other, _ in tree.find_n(self.position[row], near.shape[1])] for row in rows]
+        for row in np.flatnonzero(~solid):
+            owner[row] = tree.find(self.position[row])[1]
+        return solid, near, owner
+
+
+def _tree(places: np.ndarray, rows: Iterable[int]) -> KDTree:
+    """Return a tree of the `rows` of `places` (N, 3)."""
+    rows = list(rows)
+    tree = KDTree(len(rows))
+    for row in rows:
+        tree.insert(places[row], row)
+    tree.balance()
+    return tree
 
 
 def write_hint(file: Path, kind: str, points: np.ndarray) -> None:
@@ -74,54 +166,6 @@ def write_hint(file: Path, kind: str, points: np.ndarray) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(file) as temporary:
         temporary.write_text(json.dumps({"hints": [{"kind": kind, "points": points.tolist()}]}), encoding="utf-8")
-
-
-def _hit(splats: bpy.types.Object, origin: np.ndarray, direction: np.ndarray) -> int | None:
-    """Return the index of the splat that a ray (in object space) hits, or None."""
-    position, scale = (_attribute(splats, name, "vector", 3) for name in ("position", "scale"))
-    axes = splat_axes(_attribute(splats, "rotation", "value", 4))
-    normal = np.cross(*axes)
-    towards = position - origin
-    slope = normal @ direction
-    distance = np.einsum("na,na->n", normal, towards) / np.where(np.abs(slope) < 1e-9, np.inf, slope)
-    offset = distance[:, None] * direction - towards
-    u, v = (np.einsum("na,na->n", offset, axis) / scale[:, i] for i, axis in enumerate(axes))
-    alpha = _attribute(splats, "opacity", "value", 1)[:, 0] * np.exp(-0.5 * (u * u + v * v)) * (distance > 0)
-    hit = np.flatnonzero(alpha > 1 / 255)
-    if not len(hit):
-        return None
-    hit = hit[np.argsort(distance[hit])]
-    through = np.cumprod(1 - alpha[hit])
-    return int(hit[min(np.searchsorted(-through, -HALF), len(hit) - 1)])
-
-
-def _smooth_part(splats: bpy.types.Object, seed: int) -> np.ndarray:
-    """Return a mask (N,) of the splats that a crease-free surface connects to the `seed`."""
-    position, normal = (_attribute(splats, name, "vector", 3) for name in ("position", "normal"))
-    solid = _attribute(splats, "opacity", "value", 1)[:, 0] >= SOLID
-    solid[seed] = True
-    rows = np.flatnonzero(solid)
-    tree = KDTree(len(rows))
-    for row in rows:
-        tree.insert(position[row], row)
-    tree.balance()
-    near = np.zeros((len(position), min(NEIGHBOURS, len(rows))), int)
-    near[rows] = [[other for _, other, _ in tree.find_n(position[row], near.shape[1])] for row in rows]
-    part = np.arange(len(position)) == seed
-    front = np.array([seed])
-    while len(front):
-        pairs = np.repeat(front, near.shape[1]), near[front].ravel()
-        line = position[pairs[1]] - position[pairs[0]]
-        line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-12)
-        lifted = np.maximum(*(np.abs(np.einsum("na,na->n", normal[ends], line)) for ends in pairs))
-        smooth = np.einsum("na,na->n", *(normal[ends] for ends in pairs)) > BEND
-        front = np.unique(pairs[1][smooth & (lifted < STEP) & ~part[pairs[1]]])
-        part[front] = True
-    while (gaps := solid & ~part & (part[near].mean(axis=1) > MOST)).any():
-        part |= gaps
-    for row in np.flatnonzero(~solid):
-        part[row] = part[tree.find(position[row])[1]]
-    return part
 
 
 def _to_world(splats: bpy.types.Object) -> Matrix:

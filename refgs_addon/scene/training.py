@@ -2,7 +2,7 @@
 
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import bpy
 from mathutils import Matrix, Vector
@@ -10,6 +10,7 @@ from mathutils import Matrix, Vector
 from .. import jobs
 from ..errors import InputError
 from ..job_timers import follow_jobs
+from ..json_file import read_json
 from ..preferences import capture_folder, hints_file, log_file, mask_model, python, set_up
 from . import strokes
 from .capture_cameras import cameras_of, show_cameras
@@ -20,6 +21,8 @@ from .run_toml import capture_of
 if TYPE_CHECKING:
     import numpy as np
 
+# of a training, the part that a hint repeats, and the minutes that it may take; as in backend/refgs/train/hints.py
+REPEATED, AT_MOST = 0.6, 1.8
 CHOSEN_NEEDS = ("specular", "reflections")  # needs that have a property in `refgs_addon.properties`
 
 
@@ -134,6 +137,36 @@ def train_other_way(scene: bpy.types.Scene, folder: Path, need: str) -> jobs.Job
     return job
 
 
+class HintPlan(NamedTuple):
+    """Hold what a training with a hint would do: continue the run in `folder`, trained on `capture`, into the new folder `out`.
+
+    `minutes` is about how long it takes, without the mesh.
+    """
+
+    folder: Path
+    capture: Path
+    out: Path
+    minutes: int
+
+
+def plan_hint(scene: bpy.types.Scene, collection: bpy.types.Collection) -> HintPlan:
+    """Return what a training with a hint about a run would do. Raises InputError if the run's checkpoint or its capture is missing."""
+    from .export_run import run_folder
+
+    folder = run_folder(collection)
+    if not any((folder / "checkpoints").glob("*.toml")):
+        raise InputError(f"{folder.name} has no checkpoint to train from: import the run as it was trained")
+    capture = _trained_capture(scene, folder)
+    if capture is None or not capture.is_dir():
+        raise InputError(f"the photos of {folder.name} are no longer at {capture}: put them back there")
+    try:
+        minutes = min(REPEATED * float(read_json(folder / "metrics.json")["training_seconds"]) / 60, AT_MOST)
+    except (InputError, KeyError, TypeError, ValueError):  # not there, or damaged
+        minutes = AT_MOST
+    out = _free(folder, {Path(known.folder) for known in scene.refgs.runs})
+    return HintPlan(folder, capture, out, max(1, round(minutes)))
+
+
 def train_with_hint(
     scene: bpy.types.Scene,
     collection: bpy.types.Collection,
@@ -149,15 +182,9 @@ def train_with_hint(
     capture.
     """
     from .edit import splats_of
-    from .export_run import run_folder
     from .hints import chosen_part, part_at, write_hint
 
-    trainer, folder = python(), run_folder(collection)
-    if not any((folder / "checkpoints").glob("*.toml")):
-        raise InputError(f"{folder.name} has no checkpoint to train from: import the run as it was trained")
-    capture = _trained_capture(scene, folder)
-    if capture is None or not capture.is_dir():
-        raise InputError(f"the photos of {folder.name} are no longer at {capture}: put them back there")
+    trainer, plan = python(), plan_hint(scene, collection)
     splats = splats_of(collection)
     if points is None:
         points = chosen_part(splats, bpy.context.view_layer.objects.active)
@@ -165,12 +192,11 @@ def train_with_hint(
         if ray is None:
             raise InputError("no part is chosen: click on it, or select its splats as points in Edit Mode")
         points = part_at(splats, *ray)
-    out = _free(folder, {Path(known.folder) for known in scene.refgs.runs})
-    file = hints_file(out)
+    file = hints_file(plan.out)
     write_hint(file, kind, points)
-    asked = jobs.Asked(capture, out, hinted=(folder, file))
-    job = jobs.train(trainer, asked, log_file(out.name), scene.refgs.mesh)
-    _remember(scene, out, capture)
+    asked = jobs.Asked(plan.capture, plan.out, hinted=(plan.folder, file))
+    job = jobs.train(trainer, asked, log_file(plan.out.name), scene.refgs.mesh)
+    _remember(scene, plan.out, plan.capture)
     follow_jobs()
     return job
 

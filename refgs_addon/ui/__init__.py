@@ -9,6 +9,7 @@ from . import (
     decisions_box,
     drop,
     export_menu,
+    highlight,
     hint_buttons,
     icons,
     light_panel,
@@ -37,6 +38,7 @@ _MODULES = (
     closing,
     many_panel,
     panels,
+    highlight,
     hint_buttons,
 )
 _MODULES += (materials_panel, light_panel, export_menu, drop)

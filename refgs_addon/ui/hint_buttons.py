@@ -1,15 +1,22 @@
 """Define the operator that trains a run again with a hint: a part of the object's surface is metal, or is paint."""
 
+from typing import TYPE_CHECKING, ClassVar
+
 import bpy
 from bpy.props import EnumProperty, FloatVectorProperty, IntProperty
 from bpy_extras.view3d_utils import region_2d_to_origin_3d, region_2d_to_vector_3d
 from mathutils import Vector
 
-from ..errors import InputError
+from .. import jobs
+from ..errors import InputError, missing_module
 from ..scene import training
 from ..scene.questions import questions
 from ..scene.run_parts import active_run
+from . import highlight
 from .operators import OnRun, has_trainer
+
+if TYPE_CHECKING:
+    import numpy as np
 
 KINDS = "metal", "paint"
 
@@ -18,16 +25,24 @@ class Hint(OnRun, bpy.types.Operator):
     """Train the active run again with a hint: the material of a part of the object, metal or paint.
 
     The part is the piece of a `question` (see `scene.questions`), counted from 1. If it is 0, the part is what the artist has selected:
-    splats in Edit Mode, or a box or ball around splats. If nothing is selected, wait for a click on the part in the 3D view.
+    splats in Edit Mode, or a box or ball around splats. If nothing is selected, wait for a click on the part in the 3D view. Before the
+    training, the part is coloured in the 3D views and the artist is asked.
     """
 
     bl_idname = "refgs.hint"
     bl_label = "This Part Is"
+    bl_options: ClassVar = {"REGISTER"}
 
     kind: EnumProperty(name="Material", items=[("metal", "Metal", ""), ("paint", "Paint", "")])
-    origin: FloatVectorProperty(name="Origin", description="Of the ray through the clicked pixel", options={"HIDDEN"})
-    direction: FloatVectorProperty(name="Direction", description="Of this ray; zero without", options={"HIDDEN"})
-    question: IntProperty(name="Question", description="Number of the question that is answered; 0: none", min=0)
+    origin: FloatVectorProperty(
+        name="Origin", description="Of the ray through the clicked pixel", options={"HIDDEN", "SKIP_SAVE"}
+    )
+    direction: FloatVectorProperty(
+        name="Direction", description="Of this ray; zero without", options={"HIDDEN", "SKIP_SAVE"}
+    )
+    question: IntProperty(
+        name="Question", description="Number of the question that is answered; 0: none", min=0, options={"SKIP_SAVE"}
+    )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -37,45 +52,126 @@ class Hint(OnRun, bpy.types.Operator):
     def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         what = {"metal": "metal, such as chrome", "paint": "no metal: paint, plastic, glaze"}[properties.kind]
         if properties.question:
-            return f"Train again, where the outlined piece is {what}"
+            return f"Train again, where the outlined piece is {what}. You are asked before it begins"
         return (
             f"Train again, where a part is {what}. Click on the part: it is taken up to its creases. "
-            "Or first select its splats in Edit Mode, or the box or ball of a material edit around them"
+            "Or first select its splats in Edit Mode, or the box or ball of a material edit around them. "
+            "You are asked before it begins"
         )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        from ..scene.edit import splats_of
-        from ..scene.hints import chosen_part
+        try:
+            return self._begin(context)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+        except ModuleNotFoundError as error:
+            self.report({"ERROR"}, missing_module(error))
+        return {"CANCELLED"}
 
-        if self.question or chosen_part(splats_of(active_run(context)), context.view_layer.objects.active) is not None:
-            return self.execute(context)
-        context.window.cursor_modal_set("EYEDROPPER")
-        context.window_manager.modal_handler_add(self)
-        return {"RUNNING_MODAL"}
+    def _begin(self, context: bpy.types.Context) -> set[str]:
+        """Ask whether to train, or wait for a click where no part is known yet."""
+        from ..scene.edit import splats_of
+        from ..scene.hints import Surface, chosen_part
+
+        run = active_run(context)
+        plan, splats = training.plan_hint(context.scene, run), splats_of(run)
+        points = self._asked_about(run)
+        if points is None and not any(self.direction):
+            points = chosen_part(splats, context.view_layer.objects.active)
+        surface = Surface(splats)
+        if points is not None:
+            part = surface.nearest(points)
+        elif any(self.direction):
+            seed = surface.hit(Vector(self.origin), Vector(self.direction))
+            if seed is None:
+                raise InputError("no splat is under the cursor: click on the part")
+            part = surface.smooth_part(seed)
+        else:
+            self._surface, self._hovered = surface, None
+            context.window.cursor_modal_set("EYEDROPPER")
+            context.workspace.status_text_set(f"Click on the part that is {self.kind}. Esc cancels")
+            context.window_manager.modal_handler_add(self)
+            return {"RUNNING_MODAL"}
+        self._words = confirmation(plan, self.kind, float(part.mean()), context.scene.refgs.mesh)
+        highlight.show(surface.corners(part))
+        title = f"Train Again with This Part as {self.kind.capitalize()}?"
+        return context.window_manager.invoke_props_dialog(self, width=400, title=title, confirm_text="Train")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        for words in self._words:
+            self.layout.label(text=words)
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if event.type in ("RIGHTMOUSE", "ESC"):
-            context.window.cursor_modal_restore()
+            self._end_click(context)
             return {"CANCELLED"}
+        if event.type == "MOUSEMOVE":
+            self._hover(clicked_ray(context.screen, event.mouse_x, event.mouse_y))
         if event.type != "LEFTMOUSE" or event.value != "PRESS":
             return {"PASS_THROUGH"}  # the view can be turned
-        context.window.cursor_modal_restore()
         ray = clicked_ray(context.screen, event.mouse_x, event.mouse_y)
-        if ray is None:
-            return {"CANCELLED"}
-        self.origin, self.direction = ray
-        return self.execute(context)
+        if ray is not None and self._surface.hit(*ray) is None:
+            self.report({"WARNING"}, "No splat is under the cursor: click on the part. Esc cancels")
+            return {"RUNNING_MODAL"}
+        self._end_click(context)
+        if ray is not None:
+            try:  # in an operator of its own: one that waits for clicks cannot open a dialogue
+                bpy.ops.refgs.hint("INVOKE_DEFAULT", kind=self.kind, origin=ray[0], direction=ray[1])
+            except RuntimeError as error:
+                self.report({"ERROR"}, str(error))
+        return {"CANCELLED"}
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Clean up where the dialogue is cancelled, or Blender ends the wait for a click."""
+        self._end_click(context)
+
+    def _end_click(self, context: bpy.types.Context) -> None:
+        highlight.clear()
+        context.window.cursor_modal_restore()
+        context.workspace.status_text_set(None)
+
+    def _hover(self, ray: tuple[Vector, Vector] | None) -> None:
+        """Colour the part that a ray hits. The part that was coloured before is kept while the ray stays in it, because that is fast."""
+        seed = self._surface.hit(*ray) if ray else None
+        if seed is None:
+            self._hovered = None
+            highlight.clear()
+        elif self._hovered is None or not self._hovered[seed]:
+            self._hovered = self._surface.smooth_part(seed)
+            highlight.show(self._surface.corners(self._hovered))
+
+    def _asked_about(self, run: bpy.types.Collection) -> "np.ndarray | None":
+        """Return the positions (P, 3) of the splats that the question is about, or None without a question."""
+        if not self.question:
+            return None
+        asked = questions(run)
+        if self.question > len(asked):
+            raise InputError(f"{run.name} has no question {self.question}: import it again")
+        return asked[self.question - 1].points
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        highlight.clear()
+        return super().execute(context)
 
     def work(self, context: bpy.types.Context) -> None:
         ray = (Vector(self.origin), Vector(self.direction)) if any(self.direction) else None
-        run, points = active_run(context), None
-        if self.question:
-            asked = questions(run)
-            if self.question > len(asked):
-                raise InputError(f"{run.name} has no question {self.question}: import it again")
-            points = asked[self.question - 1].points
-        job = training.train_with_hint(context.scene, run, self.kind, ray, points)
+        run = active_run(context)
+        job = training.train_with_hint(context.scene, run, self.kind, ray, self._asked_about(run))
         self.report({"INFO"}, f"Training {job.name} with this part as {self.kind}")
+
+
+def confirmation(plan: training.HintPlan, kind: str, part: float, mesh: bool) -> list[str]:
+    """Say what a training with a hint does, in lines for a dialogue. `part` is the fraction of the splats that are held as `kind`."""
+    minutes = "a minute" if plan.minutes == 1 else f"{plan.minutes} minutes"
+    share = f"{part:.0%}" if part >= 0.01 else "less than 1%"
+    lines = [
+        f"The orange part, {share} of the splats, is held as {kind}.",
+        f"The later part of the training is repeated. This takes about {minutes}{', then the mesh is made' if mesh else ''}.",
+        f"The result is a new run, “{plan.out.name}”. This run stays as it is.",
+    ]
+    if jobs.trainings():
+        lines.append("It begins when the trainings before it have ended.")
+    return lines
 
 
 def clicked_ray(screen: bpy.types.Screen, x: int, y: int) -> tuple[Vector, Vector] | None:

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 from mathutils import Matrix, Vector
 
+from refgs.train import hints as trained_again
 from refgs_addon import jobs
 from refgs_addon.errors import InputError
 from refgs_addon.scene import training
 from refgs_addon.scene.deleted_splats import add_points
 from refgs_addon.scene.edit import add_edit
-from refgs_addon.scene.hints import chosen_part, part_at
+from refgs_addon.scene.hints import Surface, chosen_part, part_at
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.regions import REGION
-from refgs_addon.ui.hint_buttons import clicked_ray
+from refgs_addon.ui.hint_buttons import clicked_ray, confirmation
 from tests.makers.distances import spread
 from tests.makers.still_life import BALL, FAINT, SIDE, write_still_life
 from tests.makers.waiting import final_state, until
@@ -140,6 +141,35 @@ def test_each_hint_has_a_folder_and_a_file_of_its_own(still, addon):
         files.add(job.commands[0]["hints"])
     assert len(files) == 2 and [job.run.name for job in jobs.JOBS[-2:]] == ["still 2", "still 3"]
     until(lambda: job.ended, 60)
+
+
+@pytest.mark.parametrize(
+    ("metrics", "minutes"),
+    [({"training_seconds": 20}, 1), ({"training_seconds": 100}, 1), ({"training_seconds": 9999}, 2), ({}, 2)],
+)
+def test_a_hint_says_what_it_will_do(still, addon, tmp_path, metrics, minutes):
+    """Check the words of the dialogue, and that making them starts and writes nothing."""
+    assert pytest.approx(training.REPEATED) == 1 - trained_again.AGAIN
+    assert training.AT_MOST == trained_again.AT_MOST
+    (tmp_path / "still" / "metrics.json").write_text(json.dumps(metrics))
+    before, begun = {*tmp_path.rglob("*")}, len(jobs.JOBS)
+    plan = training.plan_hint(addon, still.collection)
+    assert plan == (tmp_path / "still", tmp_path / "good photos", tmp_path / "still 2", minutes)
+    first, second, third = confirmation(plan, "metal", 0.25, True)
+    assert first == "The orange part, 25% of the splats, is held as metal."
+    assert second.endswith(f"about {'a minute' if minutes == 1 else '2 minutes'}, then the mesh is made.")
+    assert "“still 2”" in third
+    assert {*tmp_path.rglob("*")} == before and len(jobs.JOBS) == begun and not addon.refgs.runs
+
+
+def test_the_highlight_lies_on_the_part(still):
+    surface = Surface(still.splats)
+    ball = surface.smooth_part(surface.hit(*ray(still, (0.5, -9, 0.5), (0, 0, 0))))
+    np.testing.assert_array_equal(surface.nearest(surface.position[ball] + 1e-4), ball)
+    corners = surface.corners(ball).reshape(-1, 3)
+    inverse = np.array(still.splats.matrix_world.inverted())
+    radius = np.linalg.norm(corners @ inverse[:3, :3].T + inverse[:3, 3], axis=1)
+    assert len(corners) == 4 * (BALL + FAINT) and radius.max() < 1.1 and np.median(radius) > 1
 
 
 def test_what_a_hint_needs(still, addon, tmp_path):

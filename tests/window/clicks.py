@@ -1,12 +1,29 @@
 """Click as an artist does who sees a run for the first time, and report what the clicks did.
 
-Its argument is the run folder. stage.py shows the command line.
+Arguments: the Python with the trainer, and the run folder. stage.py shows the command line.
 """
 
 import bpy
-from stage import WORDS, act, addon, after, area, choose_tab, click, install, photograph, region, report, view
+from stage import (
+    MODULE,
+    WORDS,
+    act,
+    addon,
+    after,
+    area,
+    choose_tab,
+    click,
+    hover,
+    install,
+    jobs,
+    photograph,
+    press,
+    region,
+    report,
+    view,
+)
 
-(RUN,) = WORDS
+PYTHON, RUN = WORDS
 
 
 def artist():
@@ -25,6 +42,7 @@ def artist():
     yield from show_photos()
     yield from edit_regions()
     yield from paint()
+    yield from hint()
 
 
 def choose_light():
@@ -99,6 +117,51 @@ def paint():
         splats="still splats", edit=addon("scene.edit").edits(bpy.data.objects["still splats"])[0].name
     )
     yield after(1.0)
+
+
+def hint():
+    """Say that the ball is metal. Cancel before the click, then the dialogue, then train; then answer a question, and cancel."""
+    bpy.context.preferences.addons[MODULE].preferences.python = PYTHON
+    bpy.context.scene.refgs.mesh = False
+    bpy.context.view_layer.objects.active = bpy.data.objects["still mesh"]
+    shown = region("WINDOW")
+    ball = shown.x + shown.width // 2, shown.y + shown.height // 2
+    report["begun"], highlighted = {}, addon("ui.highlight")
+
+    def count(step):
+        begun = sum(job.run is not None for job in jobs())
+        report["begun"][step] = begun, len(bpy.context.scene.refgs.runs), highlighted._handler is not None
+
+    yield after(3.0)
+    for step in ("hovered", "asked", "agreed"):
+        with view():
+            bpy.ops.refgs.hint("INVOKE_DEFAULT", kind="metal")
+        yield after(1.0)
+        hover(*ball)
+        yield after(3.0)
+        if step == "hovered":
+            photograph("hovered")
+            count("hovering")
+        else:
+            click(*ball)
+            yield after(3.0)
+        if step == "asked":
+            photograph("asked")
+            count("asking")
+        press("RET" if step == "agreed" else "ESC", *ball)
+        yield after(2.0)
+        if step == "asked":
+            photograph("cancelled")
+        count(step)
+    yield lambda: jobs()[-1].ended
+    report["hinted"] = jobs()[-1].state, jobs()[-1].name
+    with view():
+        bpy.ops.refgs.hint("INVOKE_DEFAULT", kind="paint", question=1)
+    yield after(3.0)
+    photograph("question")
+    press("ESC", *ball)
+    yield after(2.0)
+    count("answered")
 
 
 act(artist())

@@ -56,19 +56,20 @@ def choose_tab():
     area().tag_redraw()
 
 
-def click(x, y):
-    """Click with the left mouse button. `x` and `y` count pixels from the lower left corner of the window."""
-    window = bpy.context.window_manager.windows[0]
-    for event, value in (("MOUSEMOVE", "NOTHING"), ("LEFTMOUSE", "PRESS"), ("LEFTMOUSE", "RELEASE")):
-        window.event_simulate(type=event, value=value, x=x, y=y)
+def hover(x, y):
+    """Move the mouse. `x` and `y` count pixels from the lower left corner of the window."""
+    bpy.context.window_manager.windows[0].event_simulate(type="MOUSEMOVE", value="NOTHING", x=x, y=y)
 
 
 def press(key, x, y, **held):
-    """Press a key with the mouse at a pixel. `held` are the other keys that are down, such as ctrl=True."""
-    window = bpy.context.window_manager.windows[0]
-    window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=x, y=y)
+    """Move the mouse and press a key or button. `held` are the other keys that are down, such as ctrl=True."""
+    hover(x, y)
     for value in ("PRESS", "RELEASE"):
-        window.event_simulate(type=key, value=value, x=x, y=y, **held)
+        bpy.context.window_manager.windows[0].event_simulate(type=key, value=value, x=x, y=y, **held)
+
+
+def click(x, y):
+    press("LEFTMOUSE", x, y)
 
 
 def photograph(name):

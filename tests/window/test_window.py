@@ -24,6 +24,7 @@ from tests.makers.runs import write_run
 from tests.makers.still_life import PHOTOS, add_mesh_light_and_photos, write_still_life
 from tests.makers.training import TINY
 
+HIGHLIGHT = 84, 115, 200  # BGR, about
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -92,11 +93,15 @@ def test_the_tab_shows_in_a_window(tmp_path):
 
 
 @pytest.mark.window
-def test_first_clicks(tmp_path):
+def test_first_clicks(tmp_path, python):
     """Check that the buttons that an artist presses first show something, by real clicks and by what the window shows."""
     run = write_still_life(tmp_path / "still")
     add_mesh_light_and_photos(run)
-    report = in_window("clicks.py", tmp_path, run)
+    points = json.dumps(
+        {"questions": [{"part": 0.5, "now": "metal", "picture": "1.png", "points": [[0, -1, 0], [1, 0, 0]]}]}
+    )
+    (run / "questions.json").write_text(points)
+    report = in_window("clicks.py", tmp_path, python, run)
     assert report["imported"] == "MATERIAL"
     assert Path(report["light"]).parent.name == "world"  # a folder of Blender's HDRIs
     for name in ("left", "right"):
@@ -107,6 +112,13 @@ def test_first_clicks(tmp_path):
     assert report["painting"] == "PAINT_WEIGHT"
     for part in ("splats", "mesh"):
         assert golden(tmp_path / f"painted {part}.png") > 0.05
+    nothing, orange, one = [0, 0, False], [0, 0, True], [1, 1, False]
+    assert report["begun"] == {
+        "hovering": orange, "hovered": nothing, "asking": orange, "asked": nothing, "agreed": one, "answered": one,
+    }  # fmt: skip
+    for name in ("hovered", "asked"):
+        assert covered(tmp_path / f"{name}.png", HIGHLIGHT) > 0.02 > covered(tmp_path / "cancelled.png", HIGHLIGHT)
+    assert report["hinted"] == ["done", "still 2"] and not (tmp_path / "still 3").exists()
 
 
 @pytest.mark.window

@@ -21,6 +21,7 @@ from stage import (
     install,
     jobs,
     photograph,
+    press,
     quit_blender,
     region,
     report,
@@ -113,10 +114,17 @@ def use_result(folder):
     yield lambda: jobs()[-1].ended, "previewed"
     report["preview"] = jobs()[-1].state, jobs()[-1].line
     report["scene"] = scene.render.engine, scene.world.name
+    run = addon("scene.run_parts").active_run(bpy.context)
+    bpy.context.view_layer.objects.active = addon("scene.edit").splats_of(
+        run
+    )  # not the ball of the edit, which is a part, too
     with view():
         bpy.ops.refgs.hint("INVOKE_DEFAULT", kind="metal")
     yield lambda: True, None
     click_middle()
+    yield lambda: True, None
+    middle = region("WINDOW")
+    press("RET", middle.x + middle.width // 2, middle.y + middle.height // 2)  # Train
     yield last("running"), "hinted"
     tell("cancel")
     yield last("cancelled"), None
