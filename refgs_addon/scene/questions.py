@@ -19,8 +19,8 @@ FILE = "questions.json"
 class Question(NamedTuple):
     """Hold a question about a piece of a run's surface.
 
-    `part` is its fraction of the surface. `now` is what the training took it for, "metal" or "paint". `picture` is a file with a photo, the
-    piece as metal, and the piece as paint, side by side. `points` (P, 3) are its splats' positions, in the splats' coordinates.
+    `part` is its fraction of the surface. `now` is what the training took it for, "metal" or "paint". `picture` is a file with a photo, and
+    below it the piece as metal and as paint. `points` (P, 3) are its splats' positions, in the splats' coordinates.
     """
 
     part: float

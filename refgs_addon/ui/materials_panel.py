@@ -201,7 +201,7 @@ class MaterialPanel(Tab, bpy.types.Panel):
             box = layout.box()
             box.label(text=f"Metal or paint? {question.part:.0%}, now {question.now}", icon="QUESTION")
             if shown := thumbnail(question.picture, round(1e4 * question.part)):
-                box.template_icon(icon_value=shown, scale=6)
+                box.template_icon(icon_value=shown, scale=8)
             row = box.row(align=True)
             for kind in KINDS:
                 button = row.operator(Hint.bl_idname, text=kind.capitalize(), depress=kind == question.now)

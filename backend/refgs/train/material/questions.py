@@ -37,7 +37,8 @@ class Question(NamedTuple):
     - `part`: its fraction of the surface, by the pixels that show it
     - `now`: what the training took it for, "metal" or "paint"
     - `members` (N,): bool, its surfels
-    - `picture` (H, W, 3): sRGB bytes. A photo with the piece outlined is beside the piece as metal and as paint, in the recovered light.
+    - `picture` (H, W, 3): sRGB bytes. Below a photo that outlines the piece are the piece as metal and, beside it, as paint, at half the
+      size, in the recovered light.
     """
 
     part: float
@@ -103,7 +104,7 @@ def _picture(state: State, surfels: Surfels, seen: Seen, fit: Fit, members: Tens
         changed = inputs._replace(surfels=Surfels(*(value.to(state.device) for value in kind)))
         color = probe.picture(state, view, changed, whole=True).color.numpy(force=True)
         panels.append(as_bytes(color[rows, columns]))
-    return np.concatenate(panels, axis=1)
+    return np.concatenate([panels[0].repeat(2, axis=0).repeat(2, axis=1), np.concatenate(panels[1:], axis=1)])
 
 
 def _around(shown: np.ndarray, size: int) -> slice:
