@@ -16,18 +16,16 @@ from mathutils.kdtree import KDTree
 from ..errors import InputError
 from .atomic_file import atomic_write
 from .deleted_splats import points_of
+from .questions import KINDS
 from .regions import REGION
 from .splat_cloud import splat_axes
 
-KINDS = ("metal", "paint")
 HALF = 0.5  # of the light along a ray, which the splats in front let through at the splat that is under the cursor
 SOLID = 0.2  # opacity of splats that make up a surface; fainter ones belong to the part of the nearest solid one
 NEIGHBOURS = 13  # the splat itself is among them
 MOST = 0.6  # of a splat's neighbours that are in a part, above which it belongs there, whatever its normal
 BEND = np.cos(np.radians(15))  # of the normals of two neighbours on a smooth surface; at a crease they differ more
-LIFT = (
-    0.004  # of the highlight above the surface, as a part of the run's longest side: the mesh may lie above the splats
-)
+LIFT = 0.004  # of the highlight above the surface, in the run's longest side: the mesh may lie above the splats
 STEP = 0.35  # sine of the angle between a smooth surface and the line to a neighbour on it
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 FILE = "questions.json"
+KINDS = "metal", "paint"
 
 
 class Question(NamedTuple):

@@ -18,8 +18,6 @@ from .operators import OnRun, has_trainer
 if TYPE_CHECKING:
     import numpy as np
 
-KINDS = "metal", "paint"
-
 
 class Hint(OnRun, bpy.types.Operator):
     """Train the active run again with a hint: the material of a part of the object, metal or paint.

@@ -19,9 +19,8 @@ RECOVERED_LIGHT, OTHER = 0, 1  # numbers of the lights that are no files; OTHER 
 # Numbers of the files, in the order in which they were first listed. Blender's buttons hold an enum's number as a float32, which rounds
 # numbers above 2 ** 24.
 _numbers: dict[str, int] = {}
-_texts: dict[
-    str, str
-] = {}  # all texts ever listed: an open menu points at them, and Blender keeps no references to them
+# All texts ever listed: an open menu points at them, and Blender keeps no references to them.
+_texts: dict[str, str] = {}
 
 
 def _lights(self, context: bpy.types.Context) -> list[tuple[str, str, str, int, int]]:

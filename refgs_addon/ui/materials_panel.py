@@ -13,10 +13,10 @@ from ..preferences import wrapped_text
 from ..scene.doubt import doubt_shown, doubt_words, has_doubt, show_doubt
 from ..scene.edit import add_edit, edits, remove_edit
 from ..scene.material_presets import PRESETS, ROOT, materials, remove_material, save_material, set_material
-from ..scene.questions import questions
+from ..scene.questions import KINDS, questions
 from ..scene.run_parts import active_run, parts
 from .export_menu import ApplyEdits
-from .hint_buttons import KINDS, Hint
+from .hint_buttons import Hint
 from .icons import thumbnail
 from .operators import OnRun, ReportsErrors, select_only, show_materials
 from .panels import Tab
