@@ -5,11 +5,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from refgs.model.learned import DARKEST
 from refgs.model.surfels import raw_metallic
 from refgs.render.baselines import LinearLight
 from refgs.train.material.metals import HELD
 
-DARKEST = 1e-6  # radiance
 RENAMED = {
     "poses": "poses.values",
     "mirrored": "light.weight",
@@ -31,7 +31,7 @@ def as_of_today(
     tensors = {RENAMED.get(name, name): value for name, value in tensors.items()}
     if not light.display and (raw := tensors.get("environment")) is not None:
         tensors = {name: value for name, value in tensors.items() if not name.startswith("adam.environment.")}
-        tensors["environment"] = light.raw(torch.nn.functional.softplus(raw).clamp_min(DARKEST))
+        tensors["environment"] = light.raw(torch.nn.functional.softplus(raw)).clamp_min(DARKEST)
     if (metallic := tensors.get("parameter.metallic")) is not None:
         tensors["parameter.held"] = torch.isin(metallic, torch.tensor([raw_metallic(value) for value in HELD]))
     elif "constant.metallic" in tensors:

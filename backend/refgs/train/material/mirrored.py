@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,12 +34,11 @@ BRIGHTEST = 20.0  # largest radiance of a mirrored lamp: photos clip it
 # A surfel without diffuse radiance falls below DIM times its median in a tenth of the photos. In dark rooms, the middle 80 % of silver
 # and chrome fall to 0.15 to 0.65; those of clay, wood, stone and red plastic to 0.56 to 0.93.
 DIM, DIMMEST = 0.6, 0.1
-LIKE_METAL = (
-    0.35  # least part of the object's radiance that a metal mirrors; silver has 0.83, chrome 0.57, a black glaze 0.14
-)
+# Least reflectance of a metal, by the light or by what it mirrors of the object. By the light, painted plastic reaches 0.3, and most metals
+# have more than 0.4. By the object, silver has 0.83, chrome 0.57, a black glaze 0.14.
+REFLECTANCE = 0.35
 LEAST_SHOWN = 0.02  # least mean radiance of what a surfel mirrors of the object: in less, errors tell more
 TOLD = 0.2  # ratio of errors of a surfel that shows the object as a metal does
-MIRROR = 0.05  # its roughness
 
 
 class Fit(NamedTuple):
@@ -75,6 +75,28 @@ def fit_both(state: State) -> tuple[Surfels, Seen, Fit]:
     return surfels, seen, _fit(seen, _mirrored(state, surfels, seen, light, turns), surfels.positions)
 
 
+class Rays(NamedTuple):
+    """Hold the N surfels' mirror rays of one photo: unit directions (N, 3), and the faces (N,) and places (N, 3) that they meet.
+
+    `face` is −1 where a ray does not meet the object. `inside` are barycentric coordinates on the face.
+    """
+
+    direction: Tensor
+    face: np.ndarray
+    inside: np.ndarray
+
+
+def mirror_rays(state: State, surfels: Surfels, seen: Seen) -> Iterator[Rays]:
+    """Trace the surfels' mirror rays of each photo in `seen`. Without a mesh (`state.occluder`), they do not meet the object."""
+    points = surfels.positions.double().numpy()
+    for normal, towards in zip(seen.normal.unbind(dim=1), seen.towards.unbind(dim=1), strict=True):
+        direction = mirror(-towards, normal)
+        face, inside = np.full(len(points), -1), np.zeros((len(points), 3), np.float32)
+        if state.occluder is not None:
+            face, inside = state.occluder.meet(points, normal.double().numpy(), direction.double().numpy())
+        yield Rays(direction, face, inside)
+
+
 def _mirrored(
     state: State, surfels: Surfels, seen: Seen, light: Environment, turns: list[Tensor]
 ) -> Iterator[tuple[list[Tensor], Tensor]]:
@@ -86,19 +108,14 @@ def _mirrored(
     """
     levels, occluder = cubemap.in_texel_order(light.levels, light.sides), state.occluder
     there = torch.zeros(0, 3) if occluder is None else _at_vertices(surfels, seen, occluder.mesh)
-    points = surfels.positions.double().numpy()
-    for view, turn in enumerate(turns):
-        normal = seen.normal[:, view]
-        direction = mirror(-seen.towards[:, view], normal)
-        levels_of = (torch.full((len(normal),), float(prefilter.level_of(roughness))) for roughness in ROUGHNESSES)
-        shown = [cubemap.sample(levels, light.sides, direction @ turn.T, level) for level in levels_of]
-        of_object = torch.zeros(len(normal), dtype=torch.bool)
+    for turn, rays in zip(turns, mirror_rays(state, surfels, seen), strict=True):
+        levels_of = (torch.full((len(rays.face),), float(prefilter.level_of(roughness))) for roughness in ROUGHNESSES)
+        shown = [cubemap.sample(levels, light.sides, rays.direction @ turn.T, level) for level in levels_of]
+        met = rays.face >= 0
+        of_object = torch.from_numpy(met)
         if occluder is not None:
-            face, inside = occluder.meet(points, normal.double().numpy(), direction.double().numpy())
-            met = face >= 0
-            corners = there[torch.from_numpy(occluder.mesh.faces[face[met]]).long()]
-            radiance = (corners * torch.from_numpy(inside[met])[..., None]).sum(dim=1)
-            of_object = torch.from_numpy(met)
+            corners = there[torch.from_numpy(occluder.mesh.faces[rays.face[met]]).long()]
+            radiance = (corners * torch.from_numpy(rays.inside[met])[..., None]).sum(dim=1)
             for each in shown:
                 each[of_object] = radiance
         yield [each.clamp_max(BRIGHTEST) for each in shown], of_object
@@ -163,7 +180,7 @@ def _fit(seen: Seen, mirrored: Iterable[tuple[list[Tensor], Tensor]], positions:
         torch.where(told, TOLD, ratio.float()),
         torch.where(told, 1.0, slope.float()),
         torch.where(told[:, None], by_object, mean.float()),
-        torch.where(told, MIRROR, torch.tensor(ROUGHNESSES)[best]),
+        torch.where(told, ROUGHNESSES[0], torch.tensor(ROUGHNESSES)[best]),
         (weighed[:, 3] > ENOUGH_PIXELS) | told,
         told,
     )
@@ -182,4 +199,4 @@ def _by_object(seen: Seen, sums: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
     levels = torch.stack([shown.nanquantile(of, dim=1).nan_to_num() for of in (DIMMEST, 0.5)], dim=1)
     dimmest, median = pooled(levels * seen.pixels[:, None], near).unbind(dim=1)
     enough = (sums[:, 6] > ENOUGH_PIXELS) & (sums[:, 7] > LEAST_SHOWN * sums[:, 6])
-    return enough & (dimmest < DIM * median) & (reflectance.amax(dim=1) > LIKE_METAL), reflectance
+    return enough & (dimmest < DIM * median) & (reflectance.amax(dim=1) > REFLECTANCE), reflectance

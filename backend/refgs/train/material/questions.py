@@ -91,9 +91,9 @@ def _picture(state: State, surfels: Surfels, seen: Seen, fit: Fit, members: Tens
         feature = members.to(state.device).float()[:, None]
         return rasterize(*discs(inputs.surfels, camera), feature, camera, near=state.near).features[..., 0]
 
-    views = probe.spread_views(state)
-    view = max(views, key=lambda view: float(shown(view).sum()))
-    piece = (shown(view) > 0.5).numpy(force=True)
+    shares = {view: shown(view) for view in probe.spread_views(state)}
+    view = max(shares, key=lambda view: float(shares[view].sum()))
+    piece = (shares[view] > 0.5).numpy(force=True)
     rows, columns = (_around(piece.any(axis=axis), size) for axis, size in ((1, piece.shape[0]), (0, piece.shape[1])))
     photo = state.photo(view, whole=True).over(state.background).numpy(force=True)
     panels = [as_bytes(photo[rows, columns])]

@@ -13,14 +13,13 @@ from scipy.sparse.linalg import cg
 from torch import Tensor
 
 from refgs.model.surfels import Surfels
-from refgs.train.material.mirrored import Fit
+from refgs.train.material.mirrored import REFLECTANCE, Fit
 from refgs.train.material.observe import Kinds, Seen, neighbours
 
 # Limits of a surfel's error as a metal, divided by its error as paint. The surfel is a metal below RATIO.metal, if its radiance changes
-# with what it mirrors by at least SLOPE, and its reflectance is at least REFLECTANCE. It is paint above RATIO.paint. Painted plastic
-# reaches a reflectance of 0.3, most metals have more than 0.4.
+# with what it mirrors by at least SLOPE, and its reflectance is at least REFLECTANCE. It is paint above RATIO.paint.
 RATIO = Kinds(metal=0.6, paint=2.5)
-SLOPE, REFLECTANCE = 0.12, 0.35
+SLOPE = 0.12
 SURE = 1.5  # evidence does not count more beyond this logarithm of that ratio
 AGAINST_METAL = 0.5  # weight of evidence for paint: a metal whose shape is wrong looks like paint
 SO_FAR = Kinds(metal=0.15, paint=0.045)  # weight of the kind that training has found so far

@@ -15,8 +15,8 @@ from torch import Tensor
 from refgs.model import cubemap
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
-from refgs.render.relight import mirror
 from refgs.train import probe
+from refgs.train.material.mirrored import mirror_rays
 from refgs.train.material.observe import OBSERVED_VIEWS, Seen
 from refgs.train.state import RenderInputs, State
 
@@ -27,7 +27,6 @@ LEAST = 0.5  # sum of weights from which on a texel is known
 DARKEST = 1e-3  # radiance; photos tell no darker ones apart
 PAINT = 0.4  # base colour that paint has in the median: half of paints are within a factor of two
 BRIGHTEST = 1e4  # times white, of lamps
-JUDGED_VIEWS = 8  # photos that decide between two lights
 
 
 @torch.no_grad()
@@ -41,16 +40,11 @@ def shown_light(state: State, surfels: Surfels, seen: Seen, metal: Tensor, refle
     texels, turns = cKDTree(directions.numpy()), state.inputs().light.turn
     total, burnt = torch.zeros(2, len(directions))
     rows = []
-    points = surfels.positions.double().numpy()
-    for number, view in enumerate(probe.spread_views(state, OBSERVED_VIEWS)):
-        normal = seen.normal[:, number]
-        towards = mirror(-seen.towards[:, number], normal)
-        free = metal & ((seen.weight[:, number] > 0) | (seen.burnt[:, number] > 0))
-        if state.occluder is not None:
-            face, _ = state.occluder.meet(points, normal.double().numpy(), towards.double().numpy())
-            free &= torch.from_numpy(face < 0)
+    views = probe.spread_views(state, OBSERVED_VIEWS)
+    for number, (view, rays) in enumerate(zip(views, mirror_rays(state, surfels, seen), strict=True)):
+        free = metal & ((seen.weight[:, number] > 0) | (seen.burnt[:, number] > 0)) & torch.from_numpy(rays.face < 0)
         turn = torch.from_numpy(turns(state.photo(view).camera)).float()
-        distance, at = texels.query((towards @ turn.T)[free].numpy(), k=np.arange(1, NEAR + 1))
+        distance, at = texels.query((rays.direction @ turn.T)[free].numpy(), k=np.arange(1, NEAR + 1))
         near = torch.from_numpy(np.exp(-0.5 * (distance / (SPREAD * math.pi / 2 / side)) ** 2)).float()
         whole, clipped = near * seen.weight[free, number, None], near * seen.burnt[free, number, None]
         shown = seen.radiance[free, number] / reflectance[free].clamp_min(0.04)
@@ -127,7 +121,7 @@ def paint_under(radiance: Tensor, surfels: Surfels, seen: Seen) -> Tensor:
 def error(state: State, inputs: RenderInputs) -> float:
     """Measure the mean squared error of some training views' pictures, over the object's pixels."""
     total, pixels = 0.0, 0
-    for view in probe.spread_views(state, JUDGED_VIEWS):
+    for view in probe.spread_views(state):
         shown = probe.on_object(state, inputs.surfels, view)
         off = probe.picture(state, view, inputs).color.clamp(0, 1) - state.photo(view).over(state.background)
         total += float(off[shown].square().sum())
