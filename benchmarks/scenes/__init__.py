@@ -8,6 +8,7 @@ places cameras and renders the photos. `lights` makes soft lights. `analytic` ma
 
 import importlib
 
+from benchmarks.scenes import still
 from scripts.demo import jar
 from scripts.demo.shapes import Scene
 
@@ -17,9 +18,15 @@ DULL = ("brushed", "embossed", "part", "tarnished")
 AMBIGUOUS = ("bowl", "brass", "dark", "gloss", "lamps", "night", "silver", "twins")
 """Photos of these can be explained twice: mirrors in the dark, silver among white, paint like metal, a hollow with content."""
 MATTE = ("matte",)
-NAMES = REFLECTIVE + AMBIGUOUS + DULL + MATTE
+STILLS = tuple(f"still-{number}" for number in range(20))
+"""Still lifes by chance, see `still`."""
+NAMES = REFLECTIVE + AMBIGUOUS + DULL + MATTE + STILLS
 
 
 def build(name: str) -> Scene:
     """Build the mesh and the materials of the scene with this name."""
-    return jar.build() if name == "jar" else importlib.import_module(f"benchmarks.scenes.{name}").build()
+    if name == "jar":
+        return jar.build()
+    if name in STILLS:
+        return still.build(STILLS.index(name))
+    return importlib.import_module(f"benchmarks.scenes.{name}").build()
