@@ -205,10 +205,7 @@ class LossSettings(_Section):
     even: float = Field(ge=0, description="edge-aware smoothness of metallic and roughness")
     alpha: float = Field(ge=0, description="agreement with the mask")
     metallic: float = Field(ge=0, description="penalty of metallic between 0 and 1, growing with progress²")
-    dark: float = Field(
-        ge=0,
-        description="penalty of metals darker than clean ones; none where photos tell that most of the surface is metal",
-    )
+    dark: float = Field(ge=0, description="penalty of metals darker than clean ones")
     matte: float = Field(ge=0, description="penalty of roughness above 0.3")
     light: float = Field(ge=0, description="penalty of a coloured mean of the light")
     prior: float = Field(

@@ -40,7 +40,7 @@ def learn(command, asked, out):
         say("progress", stage="carving", done=1, total=3)
         say("masks", what="made 3 masks", photos=3, made=3, kept=0, objects=1, **made_masks(command))
     say("decided", about="light", what="the light stands still: it brightens so")
-    say("decided", about="mirrored", what="8.0% of the surface is of a piece with metals", detail=True)
+    say("decided", about="metals", what="8% of the surface is metal", detail=True)
     say("stage", what="photos are in full size from now on", detail=True)
     while iteration < 1000:
         time.sleep(0.05 if "slow" in command["capture"] else 0.002)

@@ -236,7 +236,7 @@ def belong_together(tensors: Mapping[str, Tensor]) -> bool:
         if kind in ("parameter", "constant", "densification"):
             fine &= value.shape[:1] == ((1,) if kind == "constant" else rows)
         if kind in ("parameter", "constant", "environment", "exposure"):
-            fine &= value.dtype == (torch.bool if rest == "held" else torch.float32)
+            fine &= value.dtype == (torch.bool if rest in ("held", "told") else torch.float32)
         if kind == "adam":
             of, _, moment = rest.rpartition(".")
             learned = tensors.get(of if of in ("environment", "exposure") else f"parameter.{of}")

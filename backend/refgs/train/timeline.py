@@ -214,6 +214,14 @@ def _first_plan(state: State, step: Step) -> bool:
     return since == 10 or (since > 0 and step.done % 50 == 0)
 
 
+def _judged(state: State, step: Step) -> bool:
+    """Tell whether metals are judged in this iteration. One judgement takes as long as some dozen iterations."""
+    length, every = JUDGE.length(state), state.settings.indirect.every
+    if why_not_traced(state):
+        return step.done % length == 0
+    return step.hidden is not None and step.done // length > (step.done - every) // length
+
+
 RESIDUAL = When("`residual.start`", lambda state, step: step.progress >= state.residual_start)
 LIGHT_FIRST = When("iteration `train.light_first`", lambda state, step: step.done >= state.settings.train.light_first)
 NOT_ENDED = When("not the last iteration", lambda state, step: step.done < state.total)
@@ -233,12 +241,8 @@ LIT = When("there is a light", lambda state, step: state.method.lit)
 FROM_HULL = When("all photos have masks", lambda state, step: state.from_hull)
 DEFERRED = When("pixels are shaded", lambda state, step: state.method.deferred)
 NEW_MESH = When("a mesh was made", lambda state, step: step.hidden is not None)
-JUDGE = share(1 / 8)
-JUDGED = When(
-    f"a mesh was made; where none is, every {JUDGE.words}",
-    lambda state, step: step.hidden is not None
-    or (bool(why_not_traced(state)) and step.done % JUDGE.length(state) == 0),
-)
+JUDGE = share(1 / 4)
+JUDGED = When(f"the first mesh in each {JUDGE.words} was made; where none is, every {JUDGE.words}", _judged)
 RESTS = When(
     "for `propagation.rest` iterations after normals were propagated",
     lambda state, step: (since := since_propagation(state, step.done)) is not None

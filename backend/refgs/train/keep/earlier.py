@@ -23,7 +23,8 @@ def as_of_today(
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Convert the tensors and facts of a checkpoint of release 0.1.0 to the present form. Return those of later releases unchanged.
 
-    0.1.0 had no mask `held`: surfels with a metallic value in HELD did not learn it. All parts (see `Part`) shared one table of facts.
+    0.1.0 had no masks `held` and `told`: surfels with a metallic value in HELD did not learn it. All parts (see `Part`) shared one table
+    of facts.
     Linear light was the softplus of raw texels, and is their exponential now. `light` is how the run represents light.
     """
     if "residual" in facts:
@@ -34,8 +35,9 @@ def as_of_today(
         tensors["environment"] = light.raw(torch.nn.functional.softplus(raw)).clamp_min(DARKEST)
     if (metallic := tensors.get("parameter.metallic")) is not None:
         tensors["parameter.held"] = torch.isin(metallic, torch.tensor([raw_metallic(value) for value in HELD]))
+        tensors["parameter.told"] = torch.zeros_like(tensors["parameter.held"])
     elif "constant.metallic" in tensors:
-        tensors["constant.held"] = torch.zeros(1, dtype=torch.bool)
+        tensors["constant.held"] = tensors["constant.told"] = torch.zeros(1, dtype=torch.bool)
     harmonics = tensors.get("parameter.sh_rest")
     known = {"spent": facts.get("seconds", 0.0), "processor_seconds": 0.0, "decided": {}, "needs": {}} | facts
     known |= {"residual": harmonics is not None and bool(harmonics.any()), "clock": facts.get("parts", {})}

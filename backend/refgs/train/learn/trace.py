@@ -42,23 +42,32 @@ class TracedMesh(Part):
 
 
 @torch.no_grad()
+def mesh_of(state: State, surfels: Surfels) -> Occluder | None:
+    """Make a mesh of `surfels`, on which rays are traced. Return None if there is no surface yet."""
+    trim()  # free memory for the depth maps of all cameras
+    capture, cameras = state.capture, state.spread_cameras(MESH_VIEWS)
+    with state.clock.part("mesh"):
+        side = state.settings.indirect.resolution
+        mesh, _ = extract(surfels, cameras, state.near, capture.centre, capture.radius, side)
+        try:
+            return Occluder(clean(mesh, triangles=len(mesh.faces)))
+        except InputError:
+            return None
+
+
+@torch.no_grad()
 def make_mesh(state: State, step: Step) -> None:
     """Make the mesh `state.occluder`, and `step.hidden`, the fraction of pixels that mirror the object."""
     if why_not_traced(state):
         return
     with state.clock.part("visibility"):
-        capture, cameras = state.capture, state.spread_cameras(MESH_VIEWS)
+        cameras = state.spread_cameras(MESH_VIEWS)
         state.occluder = None
-        trim()  # free memory for the depth maps of all cameras
         inputs = state.inputs()
         inside = inputs.surfels.chosen(state.wanted())
-        with state.clock.part("mesh"):
-            side = state.settings.indirect.resolution
-            mesh, _ = extract(inside, cameras, state.near, capture.centre, capture.radius, side)
-            try:
-                state.occluder = Occluder(clean(mesh, triangles=len(mesh.faces)))
-            except InputError:  # there is no surface yet
-                return
+        state.occluder = mesh_of(state, inside)
+        if state.occluder is None:
+            return
         inputs, hidden, solid = inputs._replace(surfels=inside, occluder=state.occluder), 0.0, 1e-9
         for camera in cameras[::3]:
             seen = state.picture(inputs, camera)

@@ -22,12 +22,6 @@ LEAST_SURFELS = 400  # fewer surfels tell nothing
 SMOOTHED = 32  # neighbours whose normals are averaged: those of single surfels are rough early in the training
 LOBES, SHARPNESS = 50, 10.0  # lobes of the mirrored direction, 0.3 radians wide: they cover the sphere
 RIDGE = 1e-3  # ridge, as a fraction of the columns' mean square
-# A light changed only if it explains this much more than mirroring; matte clay has 0.19, seven metals up to 0.08, a sharp mirror 0.17.
-CHANGED = 0.13
-# A light changed only if mirroring explains less than this of the rest; matte clay has 0.03, a sharp mirror 0.14.
-LEFT = 0.05
-# Changes are noise if both models together explain less than this; a fox's fur has up to 0.19, six coloured metals from 0.42.
-NOISE = 0.3
 CELL = 0.15  # side of a grid's cells, in scene radii: models are fitted to half of the cells, tested on the others
 
 
@@ -45,31 +39,12 @@ class Explained(NamedTuple):
     mirrored: float
     both: float
 
-    @property
-    def by_changes(self) -> bool:
-        """Tell whether the light changed: `lit` is clearly above `mirrored`, and hardly below `both`.
-
-        A high `lit` alone proves nothing: in a single photo, the mirror direction is nearly a function of the normal, too.
-        """
-        return self.lit - self.mirrored > CHANGED and self.both - self.lit < LEFT * (1 - self.lit)
-
-    @property
-    def by_mirroring(self) -> bool:
-        """Tell whether the surface mirrors: `mirrored` is above NOISE, and the light did not change."""
-        return self.mirrored > NOISE and not self.by_changes
-
-    @property
-    def by_none(self) -> bool:
-        """Tell whether the changes are noise: neither model explains them."""
-        return self.both < NOISE
-
 
 @torch.no_grad()
-def explained(observations: Observations, positions: Tensor, radius: float, *parts: Tensor) -> list[Explained]:
-    """Measure how well two models explain a surface's changes from photo to photo: a changing light, and mirroring.
+def explained(observations: Observations, positions: Tensor, radius: float) -> Explained:
+    """Measure how well two models explain the surface's changes from photo to photo: a changing light, and mirroring.
 
-    Each of `parts` (N,) is a mask of surfels, and gets one result. Changes and normals are averaged over neighbours. `radius` is the
-    scene's radius in world units.
+    Changes and normals are averaged over neighbours. `radius` is the scene's radius in world units.
     """
     near = neighbours(positions, SMOOTHED)
     mean, change, known = averaged(observations, near)
@@ -78,7 +53,7 @@ def explained(observations: Observations, positions: Tensor, radius: float, *par
     normal = observations.normal
     smooth = torch.nn.functional.normalize(pooled(normal.flatten(1), near).view_as(normal), dim=2)
     smoothed = observations._replace(normal=smooth)
-    return [_explained(smoothed, relative, known & part[:, None], positions / (CELL * radius)) for part in parts]
+    return _explained(smoothed, relative, known, positions / (CELL * radius))
 
 
 def _explained(observations: Observations, relative: Tensor, known: Tensor, cells: Tensor) -> Explained:

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from refgs.model.surfels import Surfels
-from refgs.train.material.changes import SATURATED
 from refgs.train.material.metals import Metals
-from refgs.train.material.observe import from_grey, neighbours, pooled
+from refgs.train.material.observe import COLOURED, from_grey, neighbours, pooled
 from refgs.train.state import State
 from refgs.train.timeline import Step
 
@@ -22,7 +21,7 @@ METALLIC = 0.8
 
 def coloured_metal(surfels: Surfels) -> Tensor:
     """Tell which surfels (N,) are coloured metal, by the materials learned so far."""
-    return (surfels.metallic > METALLIC) & (from_grey(surfels.albedo).norm(dim=1) > SATURATED)
+    return (surfels.metallic > METALLIC) & (from_grey(surfels.albedo).norm(dim=1) > COLOURED)
 
 
 @torch.no_grad()

@@ -25,6 +25,7 @@ LEAST_VIEWS = 6  # photos that must show a surfel
 LEAST_CLIPPED = 0.05  # part of a surfel's pixels; where more are clipped, highlights look too white
 DARK = 0.03  # linear radiance; darker surfels do not count for a photo's exposure
 NEIGHBOURS = 64  # surfels whose changes are averaged, because too few photos show a single one
+COLOURED = 0.08  # distance from grey; below it, metals and dielectrics change alike; silver has 0.03, copper 0.14
 GRAZING = 0.15  # least cosine between normal and camera; at more grazing angles, normals are not good enough
 
 

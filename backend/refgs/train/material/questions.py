@@ -18,9 +18,7 @@ from refgs.model.surfels import Surfels
 from refgs.render.rasterize import rasterize
 from refgs.render.volume import discs
 from refgs.train import probe
-from refgs.train.material.mirrored import Fit
-from refgs.train.material.observe import Seen
-from refgs.train.material.same_material import FRINGE, laplacian
+from refgs.train.material.reckoning import Reckoned
 from refgs.train.state import State
 
 DOUBTFUL = 0.5  # photos do not tell metal from paint if doubt is at least this
@@ -48,31 +46,32 @@ class Question(NamedTuple):
 
 
 @torch.no_grad()
-def ask(state: State, surfels: Surfels, seen: Seen, fit: Fit, doubt: Tensor) -> list[Question]:
+def ask(state: State, found: Reckoned, doubt: Tensor) -> list[Question]:
     """Find the largest pieces of which photos do not tell what they are, the largest first. All arguments are on the CPU."""
+    surfels, seen = found.surfels, found.seen
     weight = (seen.pixels * state.wanted().cpu()).double().numpy()
     whole = max(weight.sum(), 1e-6)
     questions = []
-    for members in pieces(surfels, seen, doubt, weight):
+    for members in pieces(found, doubt, weight):
         size = weight * members
         share = size.sum() / whole
         if share < LEAST or len(questions) == MOST:
             break
         metal = (surfels.metallic.double().numpy() * size).sum() / size.sum() > 0.5
         mask = torch.from_numpy(members)
-        picture = _picture(state, surfels, seen, fit, mask)
+        picture = _picture(state, found, mask)
         questions.append(Question(float(share), "metal" if metal else "paint", mask, picture))
     return questions
 
 
-def pieces(surfels: Surfels, seen: Seen, doubt: Tensor, weight: np.ndarray) -> list[np.ndarray]:
+def pieces(found: Reckoned, doubt: Tensor, weight: np.ndarray) -> list[np.ndarray]:
     """Divide the surfels whose doubt is at least DOUBTFUL into pieces. Return their masks (N,), those with the largest `weight` first.
 
     Surfels that hardly any pixel shows belong where the nearest of the others does.
     """
-    shown, points = (seen.pixels > FRINGE).numpy(), surfels.positions.numpy()
+    shown, points = found.shown.numpy(), found.surfels.positions.numpy()
     open_ = (doubt >= DOUBTFUL).numpy() & shown
-    links = (-laplacian(surfels.positions, seen)).tocoo()
+    links = (-found.graph).tocoo()
     kept = (links.data > LINK) & open_[links.row] & open_[links.col] & (links.row != links.col)
     links.data, links.row, links.col = links.data[kept], links.row[kept], links.col[kept]
     _, number = connected_components(links, directed=False)
@@ -81,10 +80,10 @@ def pieces(surfels: Surfels, seen: Seen, doubt: Tensor, weight: np.ndarray) -> l
     return [(open_ & (number == piece))[nearest] for piece in np.argsort(-total) if total[piece] > 0]
 
 
-def _picture(state: State, surfels: Surfels, seen: Seen, fit: Fit, members: Tensor) -> np.ndarray:
+def _picture(state: State, found: Reckoned, members: Tensor) -> np.ndarray:
     """Draw a photo, and the piece as metal and as paint. The view is the one in which the piece has the most pixels."""
     inputs = state.inputs()
-    either = _either(surfels, seen, fit, inputs.light, members)
+    either = _either(found, inputs.light, members)
 
     def shown(view: int) -> Tensor:
         camera = state.photo(view, whole=True).camera
@@ -115,14 +114,15 @@ def _around(shown: np.ndarray, size: int) -> slice:
     return slice(max(0, at[0] - margin), min(size, at[-1] + margin + 1))
 
 
-def _either(surfels: Surfels, seen: Seen, fit: Fit, light: Environment, members: Tensor) -> tuple[Surfels, Surfels]:
+def _either(found: Reckoned, light: Environment, members: Tensor) -> tuple[Surfels, Surfels]:
     """Return the surfels with the piece as the metal that fits photos best, and as paint of the radiance that photos show."""
+    surfels, seen = found.surfels, found.seen
     received = surfels.received * light.diffuse(seen.outward.to(light.radiance)).cpu()
     paint = (seen.mean / received.clamp_min(1e-4)).clamp(0.02, 0.95)
     was_paint = (surfels.metallic < 0.5)[:, None]
     paint = torch.where(was_paint, surfels.albedo, paint)
-    metal = torch.where(was_paint, fit.reflectance, surfels.albedo)
-    rough = torch.where(was_paint[:, 0], fit.roughness, surfels.roughness)
+    metal = torch.where(was_paint, found.reflectance, surfels.albedo)
+    rough = torch.where(was_paint[:, 0], found.roughness, surfels.roughness)
 
     def with_piece(albedo: Tensor, metallic: float, roughness: Tensor) -> Surfels:
         value = torch.full_like(surfels.metallic, metallic)

@@ -1,0 +1,203 @@
+"""Reckon how likely each surfel is metal: one sum of evidence, in log-odds.
+
+Each test of the photos is a term, a number for each surfel and its neighbours. The log-odds of metal against paint are a weighted sum of
+terms (a logistic regression), spread over the piece of surface that a surfel belongs to (`same_material`). The weights were fitted to still
+lifes of random shapes, materials and lights, five other scenes and two real captures; docs/notebook/scenes.md names them.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from scipy import sparse
+from torch import Tensor
+
+from refgs.geometry.visibility import Occluder
+from refgs.model.surfels import Surfels
+from refgs.train.learn import trace
+from refgs.train.material import mirrored, same_material
+from refgs.train.material.changing_light import explained
+from refgs.train.material.observe import (
+    COLOURED,
+    LEAST_PIXELS,
+    NEIGHBOURS,
+    Seen,
+    averaged,
+    from_grey,
+    neighbours,
+    observe_changes,
+    pooled,
+)
+from refgs.train.state import State, why_not_traced
+
+WEIGHTS = {
+    "fall": 7.89,
+    "fall of changes": 1.27,
+    "light's fall": -2.73,
+    "ratio": 4.58,
+    "reflectance": 9.45,
+    "object's ratio": 1.14,
+    "object's reflectance": 2.21,
+    "tint": 2.58,
+    "grey": 2.02,
+    "changing light": -15.44,
+}
+BIAS = -7.31
+LOW = 0.1  # quantile over the photos
+DARKEST = 1e-4  # radiance: photos tell no darker ones apart
+MOST_FALL, MOST_RATIO, MOST_CHANGE = 2.5, 1.5, 0.4  # terms that are larger tell no more
+ENOUGH_PIXELS = 30.0  # the neighbours' pixels in all photos from which on what they mirror of the object tells
+LEAST_SHOWN = 0.02  # least mean radiance of what a surfel mirrors of the object: in less, errors tell more
+CHANGES = 0.15  # relative change from which on its colour tells fully
+LIKE = 0.01  # weight of a metal's material if it is only fitted, relative to a learned one
+
+
+class Reckoned(NamedTuple):
+    """Hold the probability (N,) that each of N surfels is metal, and what it was reckoned from. All tensors are on the CPU.
+
+    - `metal`: the probability; 1/2 where no photo tells
+    - `reflectance` (N, 3), `roughness` (N,): values of the metal that explains the photos best
+    - `by_object` (N,): whether the reflectance follows from what photos show of the object, so that it does not depend on the light
+    - `graph`: the Laplacian of neighbouring surfels (`same_material.laplacian`)
+    - `occluder`: the mesh on which mirror rays were traced
+    - `terms`: see WEIGHTS, (N,) each, before they are spread
+    - `known` (N,): whether photos show the surfel and its neighbours well enough for terms
+    """
+
+    metal: Tensor
+    surfels: Surfels
+    seen: Seen
+    reflectance: Tensor
+    roughness: Tensor
+    by_object: Tensor
+    graph: sparse.csr_matrix
+    occluder: Occluder | None
+    terms: dict[str, Tensor]
+    known: Tensor
+
+    @property
+    def shown(self) -> Tensor:
+        """Tell which surfels (N,) enough pixels show to be reckoned."""
+        return self.seen.pixels > same_material.FRINGE
+
+
+@torch.no_grad()
+def reckon(state: State) -> Reckoned:
+    """Look at the photos, and reckon from them how likely each surfel is metal. What the training has learned so far does not count."""
+    occluder = state.occluder
+    if occluder is None and not why_not_traced(state):
+        occluder = trace.mesh_of(state, state.inputs().surfels.chosen(state.wanted()))
+    surfels, seen, rays = mirrored.observe_both(state, occluder)
+    near = neighbours(surfels.positions, NEIGHBOURS)
+    fits = mirrored.fit_both(seen, rays, near)
+    graph = same_material.laplacian(surfels.positions, seen)
+    values = terms(seen, fits, near) | terms_of_changes(state, near)
+    every, of_object = fits.everywhere, fits.of_object
+    known = (seen.pixels > same_material.FRINGE) & (every.pixels > ENOUGH_PIXELS)
+    metal = same_material.spread(graph, log_odds(values), known.float()).sigmoid()
+    by_object = (of_object.pixels > ENOUGH_PIXELS) & (of_object.mirrored > LEAST_SHOWN)
+    reflectance = torch.where(by_object[:, None], of_object.reflectance, every.reflectance)
+    roughness = torch.where(by_object, of_object.roughness, every.roughness)
+    return Reckoned(metal, surfels, seen, reflectance, roughness, by_object, graph, occluder, values, known)
+
+
+def log_odds(values: dict[str, Tensor]) -> Tensor:
+    """Weigh the terms (N,) by their names, and return their sum (N,): the log-odds of metal against paint."""
+    return BIAS + torch.stack([weight * values[name] for name, weight in WEIGHTS.items()]).sum(dim=0)
+
+
+def terms(seen: Seen, fits: mirrored.Mirrored, near: Tensor) -> dict[str, Tensor]:
+    """Compute the terms (N,) that compare what each surfel shows with what it mirrors. `near` (N, K) are neighbours to average over.
+
+    - fall: how far the darkest tenth of the photos is below the median, as a logarithm. A metal has no diffuse radiance, so it may be far
+      darker than its median.
+    - light's fall: the same of what the surfel mirrors. A metal falls only where that falls.
+    - ratio, reflectance: see `mirrored.Fit`, by the light and, as "object's …", by photos in which the surfel mirrors the object
+    - tint: whether the radiance changes along the surface's own colour (1), as a coloured metal's, or along grey (0)
+    - grey: 1 where the surface has no colour, so that its tint tells nothing
+    """
+    every, of_object = fits.everywhere, fits.of_object
+    met = of_object.pixels > ENOUGH_PIXELS
+    tint, grey = _tint(seen, near)
+    return {
+        "fall": _fall(seen.radiance.mean(dim=2), seen, near),
+        "light's fall": _fall(fits.radiance, seen, near),
+        "ratio": (-every.ratio).clamp(-MOST_RATIO, MOST_RATIO),
+        "reflectance": every.reflectance.amax(dim=1),
+        "object's ratio": met * (-of_object.ratio).clamp(-MOST_RATIO, MOST_RATIO),
+        "object's reflectance": met * of_object.reflectance.amax(dim=1),
+        "tint": tint,
+        "grey": grey,
+    }
+
+
+def _fall(radiance: Tensor, seen: Seen, near: Tensor) -> Tensor:
+    """Compute how far below its median each surfel's `radiance` (N, V) falls in a tenth of the photos: a logarithm (N,), at least 0."""
+    radiance = radiance.masked_fill(seen.weight <= 0, math.nan)
+    levels = torch.stack([radiance.nanquantile(of, dim=1).nan_to_num() for of in (LOW, 0.5)], dim=1)
+    low, median = pooled(levels * seen.pixels[:, None], near).unbind(dim=1)
+    pixels = pooled(seen.pixels[:, None], near)[:, 0].clamp_min(1e-6)
+    return _log_ratio(median / pixels, low / pixels)
+
+
+def _log_ratio(median: Tensor, low: Tensor) -> Tensor:
+    return (median.clamp_min(DARKEST) / low.clamp_min(DARKEST)).log().clamp(0, MOST_FALL)
+
+
+def _tint(seen: Seen, near: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute how much the radiance of surfels and their neighbours changes along their own colour, and which have none: (N,) each.
+
+    A dielectric's reflection has the light's colour, which is grey on average. The direction of change is the first principal axis of the
+    radiance over the photos.
+    """
+    pixels = pooled(seen.weight, near)
+    shown = pooled((seen.radiance * seen.weight[..., None]).flatten(1), near).view_as(seen.radiance)
+    known = (pixels > LEAST_PIXELS)[..., None]
+    count = known.sum(dim=1).clamp_min(1)
+    shown = shown / pixels.clamp_min(1e-6)[..., None] * known
+    mean = shown.sum(dim=1) / count
+    change = (shown - mean[:, None]) * known / mean.mean(dim=1).clamp_min(1e-2)[:, None, None]
+    covariance = change.transpose(1, 2) @ change / count[:, None]
+    axis = torch.linalg.eigh(covariance).eigenvectors[:, :, 2]
+    axis = axis * torch.sign(axis.sum(dim=1, keepdim=True))
+    axis = axis / axis.sum(dim=1, keepdim=True).clamp_min(0.2)
+    own = from_grey(mean)
+    colour = own.norm(dim=1)
+    along = ((axis - 1 / 3) * own).sum(dim=1) / colour.square().clamp_min(1e-6)
+    size = covariance.diagonal(dim1=1, dim2=2).mean(dim=1).sqrt()
+    coloured = (colour > COLOURED).float()
+    return coloured * along.clamp(-0.5, 1.5) * (size / CHANGES).clamp(0, 1), 1 - coloured
+
+
+def terms_of_changes(state: State, near: Tensor) -> dict[str, Tensor]:
+    """Compute the terms (N,) that compare photos with a model in which each surfel looks the same from everywhere (`observe_changes`).
+
+    - fall of changes: as fall, without what neighbours and background add to a surfel's pixels, and without what is seen at grazing angles
+    - changing light: how much better a light that differs between photos explains all changes than mirroring does. It is one number for
+      the whole object.
+    """
+    seen = observe_changes(state)
+    changes = explained(seen, state.learned["position"].detach(), state.capture.radius)
+    mean, change, known = (each.cpu() for each in averaged(seen, near.to(state.device)))
+    shown = (mean[:, None] + change).mean(dim=2).clamp_min(0).masked_fill(~known, math.nan)
+    low, median = (shown.nanquantile(of, dim=1).nan_to_num() for of in (LOW, 0.5))
+    changing = max(0.0, changes.lit - changes.mirrored) if changes.lit >= 0 else 0.0  # NaN: nothing is known
+    return {
+        "fall of changes": _log_ratio(median, low),
+        "changing light": torch.full_like(low, min(changing, MOST_CHANGE)),
+    }
+
+
+def like_metals(found: Reckoned) -> Tensor:
+    """Return base colour and roughness of the metals to which each surfel is connected, (N, 4)."""
+    surfels = found.surfels
+    learned, fitted = (
+        torch.cat([colour, rough[:, None]], dim=1)
+        for colour, rough in ((surfels.albedo, surfels.roughness), (found.reflectance, found.roughness))
+    )
+    # Surfels that were paint so far have learned the colour of what they mirror, so their fitted material is used. Metals have learned a
+    # wrong base colour where the light is wrong, but what they show of the object tells the right one.
+    known = (surfels.metallic > 0.5) & ~found.by_object
+    material = torch.where(known[:, None], learned, fitted)
+    weight = (2 * found.metal - 1).clamp_min(0) * torch.where(known | found.by_object, 1.0, LIKE)
+    return torch.stack([same_material.spread(found.graph, each, weight) for each in material.T], dim=1)

@@ -1,0 +1,135 @@
+"""Fit the weights by which metal is told from paint: `python -m benchmarks.reckoning CAPTURE... --show CAPTURE... --out DIR`.
+
+Each capture is a folder of `benchmarks.scenes` under the scene's name, so that its materials are known, or one that is named by `--metal`
+or `--paint`: all of it is that. A training of each stops after two thirds. At a tenth, a third, and then, the terms of
+`refgs.train.material.reckoning` are written to DIR. Captures that DIR holds are not trained again.
+
+A logistic regression on the captures before `--show` gives the weights. The table says how they do on all captures: which part of the
+surface is wrong, in doubt, and right where it is not in doubt.
+"""
+
+import argparse
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from benchmarks.scenes import NAMES, build
+from refgs.asked import Asked
+from refgs.capture import read_files, to_run_frame
+from refgs.effective import Effective
+from refgs.train.material import questions, reckoning, same_material
+from refgs.train.state import State
+from refgs.train.trainer import Trainer
+
+TOTAL, TIMES = 1500, (150, 500, 1000)
+SAMPLES = 1500  # surfels of each capture at each time, drawn by their pixels
+RIDGE = 1e-4
+
+
+class Row(NamedTuple):
+    """Hold spread terms (N, K), whether each surfel is metal (N,), and its pixels (N,)."""
+
+    terms: Tensor
+    metal: Tensor
+    pixels: Tensor
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.reckoning", description=__doc__)
+    parser.add_argument("fit", nargs="+", type=Path, metavar="CAPTURE")
+    parser.add_argument("--show", nargs="*", type=Path, default=[], metavar="CAPTURE")
+    parser.add_argument("--metal", nargs="*", default=[], metavar="NAME", help="captures that are all metal")
+    parser.add_argument("--paint", nargs="*", default=[], metavar="NAME", help="captures that are all paint")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    kinds = dict.fromkeys(options.metal, True) | dict.fromkeys(options.paint, False)
+    rows = {}
+    for capture in (*options.fit, *options.show):
+        file = options.out / f"{capture.name}.pt"
+        if not file.exists():
+            torch.save([tuple(row) for row in observed(capture, kinds.get(capture.name), options.out)], file)
+        rows[capture.name] = [Row(*each) for each in torch.load(file)]
+    weights = fitted([rows[capture.name] for capture in options.fit])
+    for name, weight in zip(("bias", *reckoning.WEIGHTS), weights.tolist(), strict=True):
+        print(f"{name}: {weight:.2f}")
+    for capture in (*options.fit, *options.show):
+        cells = " | ".join(line(row, weights) for row in rows[capture.name])
+        print(f"{'shown' if capture in options.show else 'fitted'} {capture.name}: {cells}")
+
+
+def observed(capture: Path, kind: bool | None, out: Path) -> Iterable[Row]:
+    """Train on a capture, and yield a row at each of TIMES. `kind` tells whether all of it is metal; None: the scene's materials tell."""
+    asked = Asked(capture=capture, out=out / capture.name, preset="quick", changes=(f"train.iterations={TOTAL}",))
+    settings = asked.settings()
+    frame = to_run_frame(read_files(capture), settings.region)
+    trainer = Trainer(frame, Effective.of(settings), out / capture.name, lambda event, facts: None, None)
+    state, metal_at = trainer.state, partial(true_metal, capture.name) if kind is None else None
+    while state.iteration < max(TIMES):
+        trainer.iterate()
+        if state.iteration in TIMES:
+            yield row(state, kind, metal_at, np.asarray(frame.to_capture))
+
+
+def row(state: State, kind: bool | None, metal_at, to_capture: np.ndarray) -> Row:
+    found = reckoning.reckon(state)
+    values = torch.stack([found.terms[name] for name in reckoning.WEIGHTS], dim=1)
+    spread = [same_material.spread(found.graph, each, found.known.float()) for each in values.T]
+    points = found.surfels.positions.double().numpy()
+    points = (np.c_[points, np.ones(len(points))] @ to_capture.T)[:, :3]
+    metal = torch.full((len(points),), bool(kind)) if kind is not None else metal_at(points)
+    return Row(torch.stack(spread, dim=1), metal, found.seen.pixels * state.wanted().cpu())
+
+
+def true_metal(name: str, points: np.ndarray) -> Tensor:
+    """Tell which points (N, 3) are next to metal in a scene of `benchmarks.scenes`."""
+    if name not in NAMES:
+        raise SystemExit(
+            f"{name}: no scene of benchmarks.scenes; name it after --metal or --paint if all of it is that"
+        )
+    scene = build(name)
+    nearest = cKDTree(scene.mesh.vertices[scene.mesh.triangles].mean(axis=1)).query(points)[1]
+    metallic = [material.metallic == 1.0 for material in scene.materials]
+    return torch.tensor(metallic)[torch.from_numpy(scene.mesh.material[nearest])]
+
+
+def fitted(captures: list[list[Row]]) -> Tensor:
+    """Fit a logistic regression with a small ridge, by Newton's method. Each capture counts the same. Returns the bias and the weights."""
+    generator, parts = torch.Generator().manual_seed(0), []
+    for rows in captures:
+        for each in rows:
+            drawn = torch.multinomial(each.pixels, SAMPLES, True, generator=generator)
+            parts.append(
+                (each.terms[drawn].double(), each.metal[drawn].double(), torch.full((SAMPLES,), 1 / len(rows)))
+            )
+    terms, metal, weight = (torch.cat(each) for each in zip(*parts, strict=True))
+    mean, scale, weight = terms.mean(dim=0), terms.std(dim=0).clamp_min(1e-6), weight.double() / weight.sum()
+    columns = torch.cat([torch.ones(len(terms), 1).double(), (terms - mean) / scale], dim=1)
+    ridge = RIDGE * torch.eye(columns.shape[1]).double()
+    ridge[0, 0] = 0
+    found = torch.zeros(columns.shape[1]).double()
+    for _ in range(50):
+        likely = torch.sigmoid(columns @ found)
+        slope = columns.T @ (weight * (likely - metal)) + ridge @ found
+        curvature = (columns.T * (weight * likely * (1 - likely))) @ columns + ridge
+        found = found - torch.linalg.solve(curvature + 1e-9 * torch.eye(len(found)).double(), slope)
+    weights = found[1:] / scale
+    return torch.cat([found[:1] - (weights * mean).sum(), weights]).float()
+
+
+def line(row: Row, weights: Tensor) -> str:
+    likely = torch.sigmoid(weights[0] + row.terms @ weights[1:])
+    right, sure = (likely > 0.5) == row.metal, (2 * likely - 1).abs() > questions.DOUBTFUL
+    part = row.pixels / row.pixels.sum()
+    among = float((part * sure * right).sum() / (part * sure).sum().clamp_min(1e-9))
+    return f"wrong {float((part * ~right).sum()):.1%}, doubt {float((part * ~sure).sum()):.1%}, else right {among:.1%}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,343 @@
+"""Test how surfels are told metal or paint by what photos show of them, and what follows for a training."""
+
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from refgs.formats.splats import read_splats
+from refgs.model.surfels import activate, raw_metallic
+from refgs.train.keep.asset import write_asset
+from refgs.train.learn.densify import Densification, densify
+from refgs.train.material import metals, mirrored, questions, reckoning, same_material
+from refgs.train.material.observe import NEIGHBOURS, Seen, neighbours
+from refgs.train.trainer import ACTIONS
+from tests.makers.lamps import LAMPS, ORANGE, show
+from tests.makers.pieces import ball_on_board, seen_as
+from tests.makers.training import do, put
+from tests.makers.training import trainer as small
+
+DIM = 1.3  # radiance of lamps whose mirror images are not clipped
+GREY, GOLD = [3.0, 3.0, 3.0], [3.0, 1.0, -1.0]  # logits: 0.95, 0.73, 0.27
+ALL = ["surfels.sh_degree=0", "needs.specular=on", "needs.outside=off", "indirect.every=100"]
+
+
+@pytest.fixture
+def made(large_ball, tmp_path):
+    made = small(large_ball, tmp_path / "run", *ALL, total=400)
+    made.state.part(metals.Metals).found, made.state.iteration = True, 100
+    return made
+
+
+def told(made):
+    """Return which parts of the surface are told to be metal, to be paint, and are in doubt."""
+    found = reckoning.reckon(made.state)
+    weight = found.seen.pixels / found.seen.pixels.sum()
+    sure = (2 * found.metal - 1).abs() > questions.DOUBTFUL
+    metal, paint = sure & (found.metal > 0.5), sure & (found.metal < 0.5)
+    return tuple(float(weight[which].sum()) for which in (metal, paint, ~sure))
+
+
+@pytest.mark.parametrize("turn", [False, True])
+@pytest.mark.parametrize("roughness", [-3.0, -1.0])
+@pytest.mark.parametrize("albedo", [GREY, GOLD])
+def test_a_metal_is_told(made, roughness, albedo, turn):
+    show(made, metallic=6.0, roughness=roughness, albedo=albedo, turn=turn, lamp=DIM)
+    metal, paint, _ = told(made)
+    assert metal > 0.8 and paint < 0.05
+
+
+@pytest.mark.parametrize("exposure", [(1.0,), (1.0, 0.8, 1.2)])
+@pytest.mark.parametrize(
+    "albedo, roughness", [([1.0, 1.0, 1.0], -1.0), (ORANGE, -1.0), (ORANGE, -2.5), ([-4.0] * 3, -1.0), (ORANGE, 6.0)]
+)
+def test_paint_is_told(made, albedo, roughness, exposure):
+    """Check white and orange paint, orange and black glaze, and matte orange, under lamps that are much brighter than the rest."""
+    show(made, metallic=-6.0, roughness=roughness, albedo=albedo, exposure=exposure)
+    metal, paint, _ = told(made)
+    assert paint > 0.8 and metal < 0.02
+
+
+def test_a_light_that_changes_does_not_make_metal(made):
+    """Check a matte ball that is lit from another side in each photo, taken as one under a light that stands still."""
+    state = made.state
+    state.change("render.reflection", "none", "needs", "the test has a matte ball")
+    show(made, metallic=-6.0, roughness=6.0, turn=True, lamps=LAMPS[:1])
+    state.change("light.frame", "world", "photos", "the photos do not tell")
+    state.change("render.reflection", "microfacet", "needs", "nor do they tell this")
+    metal, paint, _ = told(made)
+    assert metal < 0.02 and paint > 0.5
+
+
+def test_what_no_photo_shows_is_not_told(made):
+    show(made, metallic=6.0, roughness=-1.0)
+    state = made.state
+    state.photos[:] = [photo._replace(image=torch.full_like(photo.image, 255)) for photo in state.photos]
+    found = reckoning.reckon(state)
+    assert bool((found.metal == 0.5).all()) and not found.seen.weight.any() and found.seen.pixels.any()
+
+
+@pytest.mark.parametrize(
+    ("diffuse", "reflectance", "metal"), [(0.0, 0.9, True), (0.0, 0.5, True), (0.005, 0.04, False), (0.2, 0.04, False)]
+)
+def test_a_metal_in_the_dark_is_told_by_what_it_mirrors_of_the_object(diffuse, reflectance, metal):
+    """Check that a light which is learned a hundred times too bright does not matter where surfels mirror the object.
+
+    The four surfaces are two metals, a black glaze and a bright one. In half of the photos, they mirror the object, in the others a room
+    with a radiance of 0.002.
+    """
+    count, photos = 80, 12
+    generator = torch.Generator().manual_seed(0)
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(count, photos, 3)
+    there = 0.1 + 0.3 * torch.rand(photos, 1, 3, generator=generator).expand(photos, count, 3)
+    met = (torch.arange(photos) % 2 == 0)[:, None].expand(photos, count)
+    shown = diffuse + reflectance * torch.where(met[..., None], there, 0.002).transpose(0, 1)
+    weight = torch.full((count, photos), 4.0)
+    seen = Seen(shown, weight, 0 * weight, torch.full((count,), 48.0), shown.mean(dim=1), up, up)
+    learned = torch.where(met[..., None], there, 0.2)
+    near = neighbours(torch.rand(count, 3, generator=generator), NEIGHBOURS)
+    fits = mirrored.fit_both(seen, (([each] * 3, which) for each, which in zip(learned, met, strict=True)), near)
+    values = reckoning.terms(seen, fits, near)
+    values |= {"fall of changes": values["fall"], "changing light": torch.zeros(count)}
+    assert bool((reckoning.log_odds(values) > 0).all()) == bool((reckoning.log_odds(values) > 0).any()) == metal
+    assert bool((fits.of_object.ratio < 0).all()) == metal
+    if metal:
+        assert torch.allclose(fits.of_object.reflectance, torch.tensor(reflectance), atol=0.03)
+
+
+def reckoned(points, normals, metal, metallic, by_object=False):
+    """Make what `reckoning.reckon` returns, for probabilities `metal` (N,) and what the training has learned so far."""
+    count = len(points)
+    start = {"position": points, "albedo": torch.zeros(count, 3), "metallic": metallic, "roughness": torch.zeros(count)}
+    start |= {"rotation": torch.tensor([1.0, 0, 0, 0]).expand(count, 4), "scale": torch.zeros(count, 2)}
+    start |= {"opacity": torch.zeros(count), "received": torch.ones(count, 3), "sh_dc": torch.zeros(count, 1, 3)}
+    start |= {name: torch.zeros(count, 15, 3) for name in ("sh_rest", "indirect_rest")}
+    start["indirect_dc"] = torch.zeros(count, 1, 3)
+    start["albedo"][:, 0] = torch.where(points[:, 2] > 1, 2.0, -2.0)
+    start["roughness"] = torch.where(points[:, 2] > 1, -3.0, 0.0)
+    seen = seen_as(points, normals)
+    fitted = torch.full((count, 3), 0.8), torch.full((count,), 0.2), torch.full((count,), by_object)
+    graph = same_material.laplacian(points, seen)
+    return reckoning.Reckoned(
+        metal, activate(start), seen, *fitted, graph, None, {}, torch.ones(count, dtype=torch.bool)
+    )
+
+
+def test_metals_are_as_the_metals_around_them():
+    points, normals, ball = ball_on_board()
+    was = torch.where(ball & (points[:, 2] > 1), raw_metallic(0.98), raw_metallic(0.02))
+    like = reckoning.like_metals(reckoned(points, normals, torch.where(ball, 0.99, 0.01), was))
+    lower = like[ball & (points[:, 2] < 0.8)].mean(dim=0)
+    assert lower[0] == pytest.approx(1 / (1 + math.exp(-2)), abs=0.05), "the base colour of the upper half"
+    assert lower[3] == pytest.approx(1 / (1 + math.exp(3)), abs=0.05), "its roughness"
+
+
+@pytest.mark.parametrize("metallic, by_object", [(0.02, False), (0.98, True)])
+def test_metals_that_nothing_was_learned_of_are_as_they_fit(metallic, by_object):
+    """Check metals that were paint so far, and metals whose reflectance photos of the object tell."""
+    points, normals, ball = ball_on_board()
+    was = torch.full((len(points),), raw_metallic(metallic))
+    like = reckoning.like_metals(reckoned(points, normals, torch.where(ball, 0.99, 0.01), was, by_object))[ball]
+    assert torch.allclose(like, torch.tensor([0.8, 0.8, 0.8, 0.2]).expand_as(like), atol=0.01)
+
+
+def test_pieces_in_doubt_end_at_creases():
+    """Check that a ball and the board that it stands on are two pieces, the larger one first, without what is not in doubt."""
+    points, normals, ball = ball_on_board()
+    found = reckoned(points, normals, torch.full((len(points),), 0.5), torch.zeros(len(points)))
+    doubt = torch.where(ball & (points[:, 2] > 1.2), 0.1, 0.9)
+    weight = torch.where(ball, 3.0, 1.0).numpy()
+    first, second, *others = questions.pieces(found, doubt, weight)
+    assert np.array_equal(first, (ball & (points[:, 2] <= 1.2)).numpy()) or np.array_equal(first, (~ball).numpy())
+    assert np.array_equal(first | second, (doubt > 0.5).numpy()) and not others
+    assert weight[first].sum() >= weight[second].sum()
+
+
+def in_doubt(made, monkeypatch):
+    """Let photos leave open what all surfels are."""
+    reckon = reckoning.reckon
+    monkeypatch.setattr(
+        metals, "reckon", lambda state: reckon(state)._replace(metal=torch.full_like(reckon(state).metal, 0.5))
+    )
+
+
+def test_a_question_is_asked_about_what_photos_leave_open(made, monkeypatch):
+    """Check the question about a ball that photos leave open, its picture, and that nothing is asked of one that photos show clearly."""
+    show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
+    write_asset(made.state)
+    assert not (made.state.folder / "questions.json").exists()
+    with monkeypatch.context() as patch:
+        in_doubt(made, patch)
+        write_asset(made.state)
+    (asked,) = json.loads((made.state.folder / "questions.json").read_text())["questions"]
+    assert asked["part"] > 0.9 and asked["now"] == "metal"
+    splats = read_splats(made.state.folder / "splats.ply").positions
+    assert cKDTree(splats).query(asked["points"])[0].max() < 1e-4 and len(asked["points"]) > 0.9 * len(splats)
+    picture = cv2.imread(str(made.state.folder / asked["picture"]))
+    height, width = picture.shape[0] // 3, picture.shape[1] // 2
+    photo, below = picture[: 2 * height : 2, ::2].astype(float), picture[2 * height :].astype(float)
+    metal, paint = below[:, :width], below[:, width:]
+    assert np.abs(photo - metal).mean() < 30, "the learned metal explains the photos"
+    assert np.abs(metal - paint).mean() > 1, "the two differ"
+    write_asset(made.state)
+    assert not (made.state.folder / "questions.json").exists() and not (made.state.folder / "questions").exists()
+
+
+def test_how_much_of_the_surface_is_in_doubt_is_said(made, monkeypatch):
+    show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
+    doubt, facts, _ = metals.doubt(made.state)
+    assert len(doubt) == made.state.learned.count and facts["part"] < 0.05
+    in_doubt(made, monkeypatch)
+    doubt, facts, _ = metals.doubt(made.state)
+    assert facts["part"] > 0.9 and facts["what"] == made.state.decided["doubt"]
+    assert facts["what"] == f"photos do not tell metal from paint on {facts['part']:.0%} of the surface"
+
+
+def test_the_asset_has_the_doubt_of_the_surfels_that_are_written(made):
+    show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
+    position = made.state.learned["position"]
+    position.data[0] = 0  # within the ball, so that no photo shows it
+    doubt, facts, _ = metals.doubt(made.state)
+    write_asset(made.state)
+    splats = read_splats(made.state.folder / "splats.ply")
+    row = {tuple(place): i for i, place in enumerate(position.tolist())}
+    written = [row[tuple(place)] for place in splats.positions.tolist()]
+    assert float(doubt[0]) == 1, "what no pixel shows is in doubt"
+    assert 0 not in written and np.array_equal(splats.doubt, doubt.numpy()[written])
+    assert json.loads((made.state.folder / "metrics.json").read_text())["doubt"] == facts
+
+
+def test_metals_that_are_held_are_not_in_doubt(made, monkeypatch):
+    show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
+    in_doubt(made, monkeypatch)
+    put(made, metallic=raw_metallic(metals.HELD.metal), held=True)
+    facts = metals.doubt(made.state)[1]
+    assert facts["part"] < 0.002 and "what" not in facts, "only what hardly any pixel shows is"
+
+
+@pytest.mark.parametrize("change", ["render.reflection=none", "propagation.every=50"])
+def test_doubt_is_only_measured_where_photos_decide(large_ball, tmp_path, change):
+    assert metals.doubt(small(large_ball, tmp_path / "run", "surfels.sh_degree=0", change).state) is None
+
+
+def test_half_a_mirror_makes_all_of_it_metal(made):
+    """Check that the half of a metal ball that was learned as dark paint becomes metal like the rest."""
+    show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
+    state = made.state
+    shown = reckoning.reckon(state).shown
+    left = shown & (state.learned["position"][:, 0] < -0.2)
+    state.learned["metallic"].data[left] = raw_metallic(0.01)
+    half = torch.tensor(GOLD).sigmoid() / 2  # photos are rendered at half the light
+    state.learned["albedo"].data[:] = half.logit()
+    state.learned["albedo"].data[left] = -3.0
+    state.learned["roughness"].data[left] = 1.0
+    do(state, "judge metals", 0.25, hidden=0.1)
+    with torch.no_grad():
+        found = activate(state.learned.constant | state.learned.by_row)
+    assert float((found.metallic > 0.8)[left].float().mean()) > 0.95
+    assert torch.allclose(found.albedo[left].median(dim=0)[0], half, atol=0.05)
+    assert float(found.roughness[left].median()) == pytest.approx(1 / (1 + math.exp(3)), abs=0.02)
+    assert "was taken for paint" in state.decided["metals"]
+
+
+def test_paint_that_was_taken_for_metal_becomes_paint(made):
+    show(made, metallic=-6.0, roughness=-1.0)
+    state = made.state
+    put(made, metallic=raw_metallic(0.9))
+    do(state, "judge metals", 0.25, hidden=0.1)
+    shown = reckoning.reckon(state).shown
+    assert float((state.surfels().metallic < 0.1)[shown].float().mean()) > 0.9
+
+
+def test_only_the_first_mesh_of_a_quarter_is_judged(made, monkeypatch):
+    judged = []
+    monkeypatch.setitem(ACTIONS, "judge metals", lambda state, step: judged.append(step.done))
+    made.state.change("indirect.every", 30, "plan", "the test says so")
+    for done in range(30, 330, 30):
+        do(made.state, "judge metals", 0.25, done=done, hidden=0.1)
+    assert judged == [120, 210, 300]
+
+
+@pytest.mark.parametrize("hidden, progress, held", [(None, 0.25, False), (0.1, 0.9, False), (0.1, 0.25, True)])
+def test_materials_are_judged_with_new_meshes_unless_held(made, hidden, progress, held):
+    """Check that nothing changes between meshes, when the residual learns, and where hints hold metals."""
+    show(made, metallic=-6.0, roughness=-1.0)
+    state = made.state
+    before = raw_metallic(0.9)
+    put(made, metallic=before, held=held)
+    do(state, "judge metals", progress, hidden=hidden)
+    assert bool((state.learned["metallic"] == torch.tensor(before)).all())
+
+
+def test_where_no_mesh_is_made_materials_are_judged_by_a_clock_of_their_own(made, monkeypatch):
+    state, judged = made.state, []
+    monkeypatch.setitem(ACTIONS, "judge metals", lambda state, step: judged.append(step.done))
+    state.change("indirect.every", 30, "plan", "the test says so")
+    for done in range(1, 200):
+        do(state, "judge metals", 0.25, done=done)
+    assert judged == [], "a mesh will be made"
+    state.change("indirect.start", 1.0, "plan", "the test says so")
+    for done in range(1, 200):
+        do(state, "judge metals", 0.25, done=done)
+    assert judged == [100], "a quarter of 400 iterations"
+
+
+def test_metals_are_found_once(made):
+    show(made, metallic=6.0, roughness=-1.0, lamp=DIM)
+    state = made.state
+    state.part(metals.Metals).found = False
+    put(made, metallic=0.0)
+    do(state, "find metals", 0.25, done=99)
+    do(state, "find metals", 0.05, done=100)
+    assert not state.part(metals.Metals).found and "metals" not in state.decided
+    do(state, "find metals", 0.25, done=100)
+    with torch.no_grad():
+        metallic = activate(state.learned.constant | state.learned.by_row).metallic
+    assert state.part(metals.Metals).found and float((metallic > metals.GIVEN.metal - 1e-3).float().mean()) > 0.5
+    put(made, metallic=0.0)
+    do(state, "find metals", 0.3, done=101)
+    assert (state.learned["metallic"] == 0).all()
+
+
+def test_propagation_finds_metals_by_itself(large_ball, tmp_path):
+    made = small(large_ball, tmp_path / "run", *ALL, "propagation.every=20", total=400)
+    show(made, metallic=6.0, roughness=-1.0)
+    put(made, metallic=0.0)
+    do(made.state, "find metals", 0.25, done=100)
+    assert not made.state.part(metals.Metals).found and (made.state.learned["metallic"] == 0).all()
+
+
+def test_what_is_told_does_not_learn(made):
+    """Check that a ball of metal stays metal while everything else learns, and that halves of its surfels do, too."""
+    show(made, metallic=6.0, roughness=-1.0, lamp=DIM)
+    state = made.state
+    put(made, metallic=0.0)
+    do(state, "judge metals", 0.25, hidden=0.1)
+    held = int(state.learned["told"].sum())
+    assert held > 0.9 * int(reckoning.reckon(state).shown.sum())
+    before = state.learned["roughness"].detach().clone()
+    for _ in range(5):
+        made.step()
+    assert int((state.learned["metallic"] == raw_metallic(metals.HELD.metal)).sum()) == held
+    assert not torch.equal(state.learned["roughness"], before)
+    gradient = torch.ones(state.learned.count)
+    divided = densify(state.learned, gradient, state.settings.densify, 2 * len(gradient), divide=True)
+    state.part(Densification).restart(state)
+    made.step()
+    assert divided > 0
+    assert int((state.learned["metallic"] == raw_metallic(metals.HELD.metal)).sum()) > held + 0.5 * divided
+
+
+def test_a_metallic_that_has_the_held_value_by_chance_still_learns(ball_capture, tmp_path):
+    made = small(ball_capture, tmp_path / "run", "train.light_first=0", total=100)
+    put(made, metallic=raw_metallic(metals.HELD.metal))
+    made.state.part(metals.Metals).found = True
+    before = made.state.learned["metallic"].detach().clone()
+    put(made, held=torch.arange(len(before)) % 2 == 0)
+    made.step()
+    moved = made.state.learned["metallic"] != before
+    assert not moved[::2].any() and moved[1::2].any()
