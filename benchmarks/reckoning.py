@@ -9,7 +9,7 @@ surface is wrong, in doubt, and right where it is not in doubt.
 """
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -30,6 +30,9 @@ from refgs.train.trainer import Trainer
 TOTAL, TIMES = 1500, (150, 500, 1000)
 SAMPLES = 1500  # surfels of each capture at each time, drawn by their pixels
 RIDGE = 1e-4
+
+MetalAt = Callable[[np.ndarray], Tensor]
+"""From points (N, 3), in the capture's frame, to whether each is metal (N,)."""
 
 
 class Row(NamedTuple):
@@ -70,33 +73,36 @@ def observed(capture: Path, kind: bool | None, out: Path) -> Iterable[Row]:
     settings = asked.settings()
     frame = to_run_frame(read_files(capture), settings.region)
     trainer = Trainer(frame, Effective.of(settings), out / capture.name, lambda event, facts: None, None)
-    state, metal_at = trainer.state, partial(true_metal, capture.name) if kind is None else None
+    state, metal_at = trainer.state, true_metal(capture.name) if kind is None else partial(all_of, kind)
     while state.iteration < max(TIMES):
         trainer.iterate()
         if state.iteration in TIMES:
-            yield row(state, kind, metal_at, np.asarray(frame.to_capture))
+            yield row(state, metal_at, np.asarray(frame.to_capture))
 
 
-def row(state: State, kind: bool | None, metal_at, to_capture: np.ndarray) -> Row:
+def row(state: State, metal_at: MetalAt, to_capture: np.ndarray) -> Row:
     found = reckoning.reckon(state)
     values = torch.stack([found.terms[name] for name in reckoning.WEIGHTS], dim=1)
     spread = [same_material.spread(found.graph, each, found.known.float()) for each in values.T]
     points = found.surfels.positions.double().numpy()
     points = (np.c_[points, np.ones(len(points))] @ to_capture.T)[:, :3]
-    metal = torch.full((len(points),), bool(kind)) if kind is not None else metal_at(points)
-    return Row(torch.stack(spread, dim=1), metal, found.seen.pixels * state.wanted().cpu())
+    return Row(torch.stack(spread, dim=1), metal_at(points), found.pixels)
 
 
-def true_metal(name: str, points: np.ndarray) -> Tensor:
-    """Tell which points (N, 3) are next to metal in a scene of `benchmarks.scenes`."""
+def all_of(kind: bool, points: np.ndarray) -> Tensor:
+    return torch.full((len(points),), kind)
+
+
+def true_metal(name: str) -> MetalAt:
+    """Return a function that tells which points are next to metal in a scene of `benchmarks.scenes`."""
     if name not in NAMES:
         raise SystemExit(
             f"{name}: no scene of benchmarks.scenes; name it after --metal or --paint if all of it is that"
         )
     scene = build(name)
-    nearest = cKDTree(scene.mesh.vertices[scene.mesh.triangles].mean(axis=1)).query(points)[1]
-    metallic = [material.metallic == 1.0 for material in scene.materials]
-    return torch.tensor(metallic)[torch.from_numpy(scene.mesh.material[nearest])]
+    triangles = cKDTree(scene.mesh.vertices[scene.mesh.triangles].mean(axis=1))
+    metal = torch.tensor([material.metallic == 1.0 for material in scene.materials])[scene.mesh.material]
+    return lambda points: metal[triangles.query(points)[1]]
 
 
 def fitted(captures: list[list[Row]]) -> Tensor:

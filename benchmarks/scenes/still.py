@@ -1,7 +1,6 @@
 """Build still lifes by chance: a few things of random shapes and materials, in one of ten lights.
 
-The likelihoods of metal and paint (`refgs.train.material.reckoning`) are fitted on these alone. So every other scene shows how they do on
-what they were not fitted on.
+The weights of `refgs.train.material.reckoning`, which tell metal from paint, were fitted to these and a few other captures.
 """
 
 import colorsys

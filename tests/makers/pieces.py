@@ -27,4 +27,4 @@ def seen_as(points, normals, mean=None, shown=None):
     mean = torch.full((count, 3), 0.5) if mean is None else mean
     one = torch.ones(count, 1)
     pixels = 9 * (torch.ones(count) if shown is None else shown.float())
-    return Seen(mean[:, None], 9 * one, 0 * one, pixels, mean, normals[:, None], normals[:, None])
+    return Seen(mean[:, None], 9 * one, pixels, mean, normals[:, None], normals[:, None])

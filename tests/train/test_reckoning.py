@@ -97,7 +97,7 @@ def test_a_metal_in_the_dark_is_told_by_what_it_mirrors_of_the_object(diffuse, r
     met = (torch.arange(photos) % 2 == 0)[:, None].expand(photos, count)
     shown = diffuse + reflectance * torch.where(met[..., None], there, 0.002).transpose(0, 1)
     weight = torch.full((count, photos), 4.0)
-    seen = Seen(shown, weight, 0 * weight, torch.full((count,), 48.0), shown.mean(dim=1), up, up)
+    seen = Seen(shown, weight, torch.full((count,), 48.0), shown.mean(dim=1), up, up)
     learned = torch.where(met[..., None], there, 0.2)
     near = neighbours(torch.rand(count, 3, generator=generator), NEIGHBOURS)
     fits = mirrored.fit_both(seen, (([each] * 3, which) for each, which in zip(learned, met, strict=True)), near)
@@ -122,9 +122,8 @@ def reckoned(points, normals, metal, metallic, by_object=False):
     seen = seen_as(points, normals)
     fitted = torch.full((count, 3), 0.8), torch.full((count,), 0.2), torch.full((count,), by_object)
     graph = same_material.laplacian(points, seen)
-    return reckoning.Reckoned(
-        metal, activate(start), seen, *fitted, graph, None, {}, torch.ones(count, dtype=torch.bool)
-    )
+    known = torch.ones(count, dtype=torch.bool)
+    return reckoning.Reckoned(metal, activate(start), seen, seen.pixels, *fitted, graph, {}, known)
 
 
 def test_metals_are_as_the_metals_around_them():
@@ -159,10 +158,12 @@ def test_pieces_in_doubt_end_at_creases():
 
 def in_doubt(made, monkeypatch):
     """Let photos leave open what all surfels are."""
-    reckon = reckoning.reckon
-    monkeypatch.setattr(
-        metals, "reckon", lambda state: reckon(state)._replace(metal=torch.full_like(reckon(state).metal, 0.5))
-    )
+
+    def reckon(state):
+        found = reckoning.reckon(state)
+        return found._replace(metal=torch.full_like(found.metal, 0.5))
+
+    monkeypatch.setattr(metals, "reckon", reckon)
 
 
 def test_a_question_is_asked_about_what_photos_leave_open(made, monkeypatch):

@@ -24,8 +24,7 @@ def as_of_today(
     """Convert the tensors and facts of a checkpoint of release 0.1.0 to the present form. Return those of later releases unchanged.
 
     0.1.0 had no masks `held` and `told`: surfels with a metallic value in HELD did not learn it. All parts (see `Part`) shared one table
-    of facts.
-    Linear light was the softplus of raw texels, and is their exponential now. `light` is how the run represents light.
+    of facts. Linear light was the softplus of raw texels, and is their exponential now. `light` is how the run represents light.
     """
     if "residual" in facts:
         return tensors, facts

@@ -2,7 +2,7 @@
 
 Paint explains photos of a rough or embossed metal about as well as metal does, and black paint those of a mirror in the dark. Training
 starts near paint, so it would stay there. So whether a surfel is metal is reckoned from the photos after a tenth of the training, and again
-at each new mesh. Where photos are sure, metallic values do not learn in between.
+at some new meshes. Where photos are sure, metallic values do not learn in between.
 """
 
 from typing import NamedTuple
@@ -71,16 +71,15 @@ def _judge(state: State) -> None:
     metallic[raised], metallic[lowered] = raw_metallic(GIVEN.metal), raw_metallic(GIVEN.paint)
     metallic[metal], metallic[paint] = raw_metallic(HELD.metal), raw_metallic(HELD.paint)
     state.learned["told"].copy_(metal | paint)
-    like = like_metals(found)
-    material = torch.logit(like.clamp(0.02, 0.98)).to(metallic.device)
-    albedo[raised], roughness[raised] = material[raised, :3], material[raised, 3]
+    if raised.any():
+        material = torch.logit(like_metals(found).clamp(0.02, 0.98)).to(metallic.device)
+        albedo[raised], roughness[raised] = material[raised, :3], material[raised, 3]
     for name in names:
         state.learned.forget(name, raised | lowered)
     state.learned.forget("metallic", metal | paint)
-    weight = found.seen.pixels * state.wanted().cpu()
-    whole = max(float(weight.sum()), 1e-6)
+    whole = max(float(found.pixels.sum()), 1e-6)
     kinds = state.surfels().metallic > 0.5, raised, lowered
-    now, more, less = (float(weight[which.cpu()].sum()) / whole for which in kinds)
+    now, more, less = (float(found.pixels[which.cpu()].sum()) / whole for which in kinds)
     words = f"{now:.0%} of the surface is metal: {more:.1%} was taken for paint, {less:.1%} of it for metal is paint"
     state.announce("metals", words, detail=max(more, less) < TOLD)
 
@@ -113,8 +112,7 @@ def doubt(state: State) -> Doubt | None:
     found = reckon(state)
     values = 1 - (2 * found.metal - 1).abs()
     values[state.learned["held"].cpu() & found.shown] = 0
-    weight = found.seen.pixels * state.wanted().cpu()
-    part = float(weight[values >= questions.DOUBTFUL].sum()) / max(float(weight.sum()), 1e-6)
+    part = float(found.pixels[values >= questions.DOUBTFUL].sum()) / max(float(found.pixels.sum()), 1e-6)
     facts: dict[str, float | str] = {"part": part}
     if part > TOLD:
         facts["what"] = f"photos do not tell metal from paint on {part:.0%} of the surface"

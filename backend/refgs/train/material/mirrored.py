@@ -11,7 +11,6 @@ photos alone in which the mirror ray meets the object: these do not depend on th
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -60,17 +59,6 @@ class Mirrored(NamedTuple):
     radiance: Tensor
 
 
-class Rays(NamedTuple):
-    """Hold the N surfels' mirror rays of one photo: unit directions (N, 3), and the faces (N,) and places (N, 3) that they meet.
-
-    `face` is −1 where a ray does not meet the object. `inside` are barycentric coordinates on the face.
-    """
-
-    direction: Tensor
-    face: np.ndarray
-    inside: np.ndarray
-
-
 @torch.no_grad()
 def observe_both(
     state: State, occluder: Occluder | None
@@ -89,17 +77,6 @@ def observe_both(
     return surfels, seen, _mirrored(surfels, seen, occluder, light, turns)
 
 
-def mirror_rays(surfels: Surfels, seen: Seen, occluder: Occluder | None) -> Iterator[Rays]:
-    """Trace the surfels' mirror rays of each photo in `seen`. Without a mesh, they do not meet the object."""
-    points = surfels.positions.double().numpy()
-    for normal, towards in zip(seen.normal.unbind(dim=1), seen.towards.unbind(dim=1), strict=True):
-        direction = mirror(-towards, normal)
-        face, inside = np.full(len(points), -1), np.zeros((len(points), 3), np.float32)
-        if occluder is not None:
-            face, inside = occluder.meet(points, normal.double().numpy(), direction.double().numpy())
-        yield Rays(direction, face, inside)
-
-
 def _mirrored(
     surfels: Surfels, seen: Seen, occluder: Occluder | None, light: Environment, turns: list[Tensor]
 ) -> Iterator[tuple[list[Tensor], Tensor]]:
@@ -109,16 +86,19 @@ def _mirrored(
 
     `turns` has a rotation matrix (3, 3) for each photo. It turns directions in the run's frame into those in which `light` is sampled.
     """
-    levels = cubemap.in_texel_order(light.levels, light.sides)
+    levels, points = cubemap.in_texel_order(light.levels, light.sides), surfels.positions.double().numpy()
     there = torch.zeros(0, 3) if occluder is None else _at_vertices(surfels, seen, occluder.mesh)
-    for turn, rays in zip(turns, mirror_rays(surfels, seen, occluder), strict=True):
-        levels_of = (torch.full((len(rays.face),), float(prefilter.level_of(roughness))) for roughness in ROUGHNESSES)
-        shown = [cubemap.sample(levels, light.sides, rays.direction @ turn.T, level) for level in levels_of]
-        met = rays.face >= 0
-        of_object = torch.from_numpy(met)
+    for turn, normal, towards in zip(turns, seen.normal.unbind(dim=1), seen.towards.unbind(dim=1), strict=True):
+        direction = mirror(-towards, normal)
+        levels_of = (torch.full((len(points),), float(prefilter.level_of(roughness))) for roughness in ROUGHNESSES)
+        shown = [cubemap.sample(levels, light.sides, direction @ turn.T, level) for level in levels_of]
+        of_object = torch.zeros(len(points), dtype=torch.bool)
         if occluder is not None:
-            corners = there[torch.from_numpy(occluder.mesh.faces[rays.face[met]]).long()]
-            radiance = (corners * torch.from_numpy(rays.inside[met])[..., None]).sum(dim=1)
+            face, inside = occluder.meet(points, normal.double().numpy(), direction.double().numpy())
+            met = face >= 0
+            of_object = torch.from_numpy(met)
+            corners = there[torch.from_numpy(occluder.mesh.faces[face[met]]).long()]
+            radiance = (corners * torch.from_numpy(inside[met])[..., None]).sum(dim=1)
             for each in shown:
                 each[of_object] = radiance
         yield [each.clamp_max(BRIGHTEST) for each in shown], of_object
@@ -141,9 +121,8 @@ class _Sums:
         self._roughnesses = roughnesses
         names, shape = ("rest", "both", "power", "paint", "first"), (len(roughnesses), count, 3)
         self._sums = {name: torch.zeros(shape, dtype=torch.double) for name in names}
-        self._whole = torch.zeros(
-            count, 8, dtype=torch.double
-        )  # sums of weights, the mirrored, the shown and its square
+        # Sums of weights, the mirrored, the shown, and its square.
+        self._whole = torch.zeros(count, 8, dtype=torch.double)
 
     def add(self, weight: Tensor, shown: Tensor, mirrored: list[Tensor], cosine: Tensor) -> None:
         """Add one photo: weights (N,), linear radiance (N, 3), what is mirrored at each of ROUGHNESSES (N, 3), cosines (N,)."""

@@ -66,7 +66,6 @@ class Seen(NamedTuple):
 
     - `radiance` (N, V, 3): linear, without the photo's exposure
     - `weight` (N, V): the surfel's blending weights, summed over its pixels; 0 where it is hardly seen, clipped, or at a grazing angle
-    - `burnt` (N, V): the blending weights summed over clipped pixels; 0 where it is hardly seen, or at a grazing angle
     - `pixels` (N,): the surfel's blending weights, summed over its pixels in all photos, also where `weight` is 0
     - `mean` (N, 3): the mean radiance over the pixels that are counted in `pixels`
     - `normal` (N, V, 3): the unit normal that is blended at its pixels
@@ -75,7 +74,6 @@ class Seen(NamedTuple):
 
     radiance: Tensor
     weight: Tensor
-    burnt: Tensor
     pixels: Tensor
     mean: Tensor
     normal: Tensor
@@ -131,8 +129,8 @@ def observe_mirrored(state: State, inputs: RenderInputs, views: list[int]) -> Se
     mean = radiance.sum(dim=1) / pixels.sum(dim=1, keepdim=True).clamp_min(1e-6)
     some, normal = pixels.clamp_min(1e-6), torch.nn.functional.normalize(normal, dim=2)
     known = (pixels > LEAST_PIXELS) & ((normal * towards).sum(dim=2) > GRAZING)
-    weights = pixels * (known & (clipped < LEAST_CLIPPED * some)), clipped * known
-    return Seen(radiance / some[..., None], *weights, pixels.sum(dim=1), mean, normal, towards)
+    weight = pixels * (known & (clipped < LEAST_CLIPPED * some))
+    return Seen(radiance / some[..., None], weight, pixels.sum(dim=1), mean, normal, towards)
 
 
 def _sums(state: State, inputs: RenderInputs, view: int) -> Tensor:

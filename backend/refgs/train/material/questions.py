@@ -48,8 +48,7 @@ class Question(NamedTuple):
 @torch.no_grad()
 def ask(state: State, found: Reckoned, doubt: Tensor) -> list[Question]:
     """Find the largest pieces of which photos do not tell what they are, the largest first. All arguments are on the CPU."""
-    surfels, seen = found.surfels, found.seen
-    weight = (seen.pixels * state.wanted().cpu()).double().numpy()
+    weight = found.pixels.double().numpy()
     whole = max(weight.sum(), 1e-6)
     questions = []
     for members in pieces(found, doubt, weight):
@@ -57,7 +56,7 @@ def ask(state: State, found: Reckoned, doubt: Tensor) -> list[Question]:
         share = size.sum() / whole
         if share < LEAST or len(questions) == MOST:
             break
-        metal = (surfels.metallic.double().numpy() * size).sum() / size.sum() > 0.5
+        metal = (found.surfels.metallic.double().numpy() * size).sum() / size.sum() > 0.5
         mask = torch.from_numpy(members)
         picture = _picture(state, found, mask)
         questions.append(Question(float(share), "metal" if metal else "paint", mask, picture))

@@ -12,7 +12,6 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from refgs.geometry.visibility import Occluder
 from refgs.model.surfels import Surfels
 from refgs.train.learn import trace
 from refgs.train.material import mirrored, same_material
@@ -56,10 +55,10 @@ class Reckoned(NamedTuple):
     """Hold the probability (N,) that each of N surfels is metal, and what it was reckoned from. All tensors are on the CPU.
 
     - `metal`: the probability; 1/2 where no photo tells
+    - `pixels` (N,): how much each surfel counts for shares of the surface: its pixels in these photos, 0 beyond the region to train
     - `reflectance` (N, 3), `roughness` (N,): values of the metal that explains the photos best
     - `by_object` (N,): whether the reflectance follows from what photos show of the object, so that it does not depend on the light
     - `graph`: the Laplacian of neighbouring surfels (`same_material.laplacian`)
-    - `occluder`: the mesh on which mirror rays were traced
     - `terms`: see WEIGHTS, (N,) each, before they are spread
     - `known` (N,): whether photos show the surfel and its neighbours well enough for terms
     """
@@ -67,11 +66,11 @@ class Reckoned(NamedTuple):
     metal: Tensor
     surfels: Surfels
     seen: Seen
+    pixels: Tensor
     reflectance: Tensor
     roughness: Tensor
     by_object: Tensor
     graph: sparse.csr_matrix
-    occluder: Occluder | None
     terms: dict[str, Tensor]
     known: Tensor
 
@@ -98,7 +97,8 @@ def reckon(state: State) -> Reckoned:
     by_object = (of_object.pixels > ENOUGH_PIXELS) & (of_object.mirrored > LEAST_SHOWN)
     reflectance = torch.where(by_object[:, None], of_object.reflectance, every.reflectance)
     roughness = torch.where(by_object, of_object.roughness, every.roughness)
-    return Reckoned(metal, surfels, seen, reflectance, roughness, by_object, graph, occluder, values, known)
+    pixels = seen.pixels * state.wanted().cpu()
+    return Reckoned(metal, surfels, seen, pixels, reflectance, roughness, by_object, graph, values, known)
 
 
 def log_odds(values: dict[str, Tensor]) -> Tensor:
@@ -135,9 +135,10 @@ def _fall(radiance: Tensor, seen: Seen, near: Tensor) -> Tensor:
     """Compute how far below its median each surfel's `radiance` (N, V) falls in a tenth of the photos: a logarithm (N,), at least 0."""
     radiance = radiance.masked_fill(seen.weight <= 0, math.nan)
     levels = torch.stack([radiance.nanquantile(of, dim=1).nan_to_num() for of in (LOW, 0.5)], dim=1)
-    low, median = pooled(levels * seen.pixels[:, None], near).unbind(dim=1)
-    pixels = pooled(seen.pixels[:, None], near)[:, 0].clamp_min(1e-6)
-    return _log_ratio(median / pixels, low / pixels)
+    pixels = seen.pixels[:, None]
+    low, median, total = pooled(torch.cat([levels * pixels, pixels], dim=1), near).unbind(dim=1)
+    total = total.clamp_min(1e-6)
+    return _log_ratio(median / total, low / total)
 
 
 def _log_ratio(median: Tensor, low: Tensor) -> Tensor:
