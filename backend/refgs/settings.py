@@ -104,7 +104,7 @@ class EnvironmentSettings(_Section):
     """Learned light, a cubemap."""
 
     resolution: Literal[16, 32, 64, 128, 256] = Field(description="texels along each side of the cubemap's faces")
-    radiance: float = Field(gt=0, le=1e6, description="radiance at the start")
+    radiance: float = Field(gt=0, le=1e6, description="radiance at the start, at most: less if the photos are darker")
     diffusion: float = Field(
         ge=0,
         description="smoothing per iteration, a part of rates.environment: how much of a texel flows into its neighbours, at 64 texels "

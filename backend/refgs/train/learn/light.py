@@ -9,16 +9,20 @@ import torch
 from torch import Tensor
 
 from refgs.clock import timed
+from refgs.color import srgb_decode
 from refgs.model import cubemap
 from refgs.model.environment import Environment
 from refgs.render.mirrored_light import mirrored_light
 from refgs.settings import Settings
+from refgs.spread import spread
 from refgs.train.part import Part
 from refgs.train.state import State
 from refgs.train.timeline import Step
 
 LEAST_SIDE = 16  # texels along a side
 DIFFUSED = 64  # texels along a side for which `environment.diffusion` is given; with others, it reaches as far
+MEAN = 1 / 3  # base colour of things on average
+DARK = 1e-3  # radiance; the light never starts darker, though photos may be black
 MIRROR_VIEWS = 24  # views that tell which part of the light the object mirrors
 
 
@@ -29,9 +33,28 @@ class MirroredLight(Part):
     weight: Tensor | None = None
 
 
-def start_value(state: State) -> float:
-    """Return the value, before activation, at which the light's texels start."""
-    return float(state.method.light.raw(torch.tensor(state.settings.environment.radiance, dtype=torch.double)))
+def start_value(state: State) -> Tensor:
+    """Return the value, before activation, at which the light's texels start: a scalar on the training's device.
+
+    Under a light that starts brighter than the photos, what little a metal mirrors in a dark room is learned as a dark base colour. Photos
+    never correct that: they do not tell the scale of one from that of the other. So linear light starts at most so bright that it lights
+    a surface of the base colour MEAN like the mean of the photos.
+    """
+    light, radiance = state.method.light, state.settings.environment.radiance
+    if light.display:
+        return light.raw(torch.tensor(radiance, dtype=torch.double, device=state.device))
+    return light.raw((_shown(state) / MEAN).clamp(DARK, radiance))
+
+
+def _shown(state: State) -> Tensor:
+    """Return the object's mean radiance in some training photos, a scalar; of photos without masks, that of all pixels."""
+    sums = []
+    for photo in spread(state.photos, MIRROR_VIEWS):
+        inside = torch.ones_like(photo.encoded[..., 0]) if photo.mask is None else photo.mask.float() / 255
+        shown = srgb_decode(photo.encoded).mean(dim=-1) * inside
+        sums.append(torch.stack([shown.sum(), inside.sum()]).double())
+    shown, pixels = torch.stack(sums).sum(dim=0)
+    return shown / pixels.clamp_min(1e-6)
 
 
 def first_resolution(settings: Settings) -> int:
