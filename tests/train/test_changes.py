@@ -10,7 +10,7 @@ from refgs.train.decide.materials import SHINES
 from refgs.train.material.changes import change_seen
 from refgs.train.material.changing_light import explained
 from refgs.train.material.metals import Metals
-from refgs.train.material.observe import observe_changes
+from refgs.train.material.observe import NEIGHBOURS, neighbours, observe_changes
 from tests.makers.lamps import LAMPS, ORANGE, show
 from tests.makers.training import do, put
 from tests.makers.training import trainer as small
@@ -58,7 +58,8 @@ def test_a_small_part_that_shines_counts(made):
 
 def explanation(made):
     """Explain the changes of all surfels."""
-    return explained(observe_changes(made.state), made.state.learned["position"].detach(), made.state.capture.radius)
+    points = made.state.learned["position"].detach()
+    return explained(observe_changes(made.state), points, neighbours(points, NEIGHBOURS), made.state.capture.radius)
 
 
 def test_a_light_that_changes_explains_more_than_mirroring(made):

@@ -121,7 +121,7 @@ def reckoned(points, normals, metal, metallic, by_object=False):
     start["roughness"] = torch.where(points[:, 2] > 1, -3.0, 0.0)
     seen = seen_as(points, normals)
     fitted = torch.full((count, 3), 0.8), torch.full((count,), 0.2), torch.full((count,), by_object)
-    graph = same_material.laplacian(points, seen)
+    graph = same_material.laplacian(points, seen, neighbours(points, NEIGHBOURS))
     known = torch.ones(count, dtype=torch.bool)
     return reckoning.Reckoned(metal, activate(start), seen, seen.pixels, *fitted, graph, {}, known)
 
@@ -242,7 +242,7 @@ def test_half_a_mirror_makes_all_of_it_metal(made):
     assert float((found.metallic > 0.8)[left].float().mean()) > 0.95
     assert torch.allclose(found.albedo[left].median(dim=0)[0], half, atol=0.05)
     assert float(found.roughness[left].median()) == pytest.approx(1 / (1 + math.exp(3)), abs=0.02)
-    assert "was taken for paint" in state.decided["metals"]
+    assert "had been taken for paint" in state.decided["metals"]
 
 
 def test_paint_that_was_taken_for_metal_becomes_paint(made):

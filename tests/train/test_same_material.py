@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from refgs.train.material.observe import NEIGHBOURS, neighbours
 from refgs.train.material.same_material import laplacian, spread
 from tests.makers.pieces import ball_on_board, seen_as
 
 
 def spread_over(points, normals, value, weight, mean=None):
-    return spread(laplacian(points, seen_as(points, normals, mean)), value, weight)
+    return spread(laplacian(points, seen_as(points, normals, mean), neighbours(points, NEIGHBOURS)), value, weight)
 
 
 def test_a_balls_lower_half_is_of_its_upper_halfs_metal():

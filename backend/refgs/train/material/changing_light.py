@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from refgs.render.relight import mirror, sphere
-from refgs.train.material.observe import LEAST_PIXELS, LEAST_VIEWS, Observations, averaged, neighbours, pooled
+from refgs.train.material.observe import LEAST_PIXELS, LEAST_VIEWS, Observations, averaged, pooled
 
 SURFELS = 3000  # surfels that are looked at, at most
 LEAST_SURFELS = 400  # fewer surfels tell nothing
@@ -41,12 +41,13 @@ class Explained(NamedTuple):
 
 
 @torch.no_grad()
-def explained(observations: Observations, positions: Tensor, radius: float) -> Explained:
+def explained(observations: Observations, positions: Tensor, near: Tensor, radius: float) -> Explained:
     """Measure how well two models explain the surface's changes from photo to photo: a changing light, and mirroring.
 
-    Changes and normals are averaged over neighbours. `radius` is the scene's radius in world units.
+    Changes and normals are averaged over neighbours. `near` (N, K) are the nearest surfels, themselves first. `radius` is that of the
+    scene, in world units.
     """
-    near = neighbours(positions, SMOOTHED)
+    near = near[:, :SMOOTHED]
     mean, change, known = averaged(observations, near)
     known &= known.sum(dim=1, keepdim=True) >= LEAST_VIEWS
     relative = (change.mean(dim=2) / mean.mean(dim=1, keepdim=True).clamp_min(1e-2)).clamp(-1, 2)

@@ -80,7 +80,7 @@ def _judge(state: State) -> None:
     whole = max(float(found.pixels.sum()), 1e-6)
     kinds = state.surfels().metallic > 0.5, raised, lowered
     now, more, less = (float(found.pixels[which.cpu()].sum()) / whole for which in kinds)
-    words = f"{now:.0%} of the surface is metal: {more:.1%} was taken for paint, {less:.1%} of it for metal is paint"
+    words = f"{now:.0%} of the surface is metal: {more:.1%} had been taken for paint, and {less:.1%} is paint after all"
     state.announce("metals", words, detail=max(more, less) < TOLD)
 
 

@@ -152,13 +152,13 @@ class _Sums:
         paint = (sums["paint"] - 2 * diffuse * sums["first"] + diffuse.square() * total).sum(dim=2)
         steady = (square - mean.square() / some).sum(dim=1)  # paint that mirrors nothing
         errors = torch.cat([metal, paint, steady[None], TOLERANCE**2 * square.sum(dim=1)[None]]).clamp_min(0)
-        errors = pooled(errors.T, near)
+        errors = pooled(errors.T.float(), near)
         metal, paint, least = errors.split([len(metal), len(paint) + 1, 1], dim=1)
         ratio = (metal.amin(dim=1) + least[:, 0]) / (paint.amin(dim=1) + least[:, 0]).clamp_min(1e-12)
         best = metal.argmin(dim=1)
         rows = best, torch.arange(len(best))
         weight = sums["power"][rows] if by_power else total.expand(-1, 3)
-        summed = pooled(torch.cat([reflectance[rows] * weight, weight, light, total], dim=1), near)
+        summed = pooled(torch.cat([reflectance[rows] * weight, weight, light, total], dim=1).float(), near)
         chosen, weight, light, pixels = summed.split([3, 3, 1, 1], dim=1)
         chosen, light = chosen / weight.clamp_min(1e-12), light / pixels.clamp_min(1e-6)
         values = ratio.clamp_min(1e-12).log(), chosen, torch.tensor(self._roughnesses)[best], light[:, 0], pixels[:, 0]

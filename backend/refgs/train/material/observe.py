@@ -237,7 +237,5 @@ def neighbours(positions: Tensor, most: int, of: Tensor | None = None) -> Tensor
 
 def pooled(values: Tensor, near: Tensor) -> Tensor:
     """Sum the rows of `values` (N, …) over neighbours `near` (M, K), giving (M, …)."""
-    total = values.new_zeros(len(near), *values.shape[1:])
-    for column in near.T:
-        total += values[column]
-    return total
+    rows = values.reshape(len(values), -1)
+    return torch.nn.functional.embedding_bag(near, rows, mode="sum").view(len(near), *values.shape[1:])

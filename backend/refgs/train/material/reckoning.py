@@ -89,7 +89,7 @@ def reckon(state: State) -> Reckoned:
     surfels, seen, rays = mirrored.observe_both(state, occluder)
     near = neighbours(surfels.positions, NEIGHBOURS)
     fits = mirrored.fit_both(seen, rays, near)
-    graph = same_material.laplacian(surfels.positions, seen)
+    graph = same_material.laplacian(surfels.positions, seen, near)
     values = terms(seen, fits, near) | terms_of_changes(state, near)
     every, of_object = fits.everywhere, fits.of_object
     known = (seen.pixels > same_material.FRINGE) & (every.pixels > ENOUGH_PIXELS)
@@ -177,9 +177,9 @@ def terms_of_changes(state: State, near: Tensor) -> dict[str, Tensor]:
     - changing light: how much better a light that differs between photos explains all changes than mirroring does. It is one number for
       the whole object.
     """
-    seen = observe_changes(state)
-    changes = explained(seen, state.learned["position"].detach(), state.capture.radius)
-    mean, change, known = (each.cpu() for each in averaged(seen, near.to(state.device)))
+    seen, near = observe_changes(state), near.to(state.device)
+    changes = explained(seen, state.learned["position"].detach(), near, state.capture.radius)
+    mean, change, known = (each.cpu() for each in averaged(seen, near))
     shown = (mean[:, None] + change).mean(dim=2).clamp_min(0).masked_fill(~known, math.nan)
     low, median = (shown.nanquantile(of, dim=1).nan_to_num() for of in (LOW, 0.5))
     changing = max(0.0, changes.lit - changes.mirrored) if changes.lit >= 0 else 0.0  # NaN: nothing is known

@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.sparse.linalg import cg
 from torch import Tensor
 
-from refgs.train.material.observe import Seen, neighbours
+from refgs.train.material.observe import Seen
 
 # Weight of differences between neighbours: it decides how far evidence spreads. It grows with the number of surfels, so that evidence
 # spreads as far over a surface however densely surfels cover it. Few surfels need LEAST_REACH.
@@ -40,11 +40,14 @@ def spread(graph: sparse.csr_matrix, values: Tensor, weight: Tensor) -> Tensor:
     return torch.from_numpy(found).float()
 
 
-def laplacian(positions: Tensor, seen: Seen) -> sparse.csr_matrix:
-    """Return the Laplacian (N, N) of neighbouring surfels, with edge weights from 0 to 1."""
-    points, near = positions.double().numpy(), neighbours(positions, LINKED + 1)[:, 1:].numpy()
+def laplacian(positions: Tensor, seen: Seen, near: Tensor) -> sparse.csr_matrix:
+    """Return the Laplacian (N, N) of neighbouring surfels, with edge weights from 0 to 1.
+
+    `near` (N, K) are the nearest surfels, themselves first. At most LINKED of the others are linked.
+    """
+    points, linked = positions.double().numpy(), near[:, 1 : LINKED + 1].numpy()
     count = len(points)
-    one, other = np.repeat(np.arange(count), near.shape[1]), near.ravel()
+    one, other = np.repeat(np.arange(count), linked.shape[1]), linked.ravel()
     normal = seen.outward.double().numpy()
     apart = points[other] - points[one]
     apart /= np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-12)
