@@ -8,6 +8,7 @@ from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.capture import LoadedView
+from refgs.color import srgb_decode
 
 MARGIN = 10  # pixels around the mask; a D-SSIM window, whose radius is 5, never covers object and border
 
@@ -46,6 +47,12 @@ class Photo(NamedTuple):
     def encoded(self) -> Tensor:
         """Return the sRGB-encoded photo, float32 (H, W, 3); an EXR may exceed 1 (white)."""
         return self.image.float() / self.white
+
+    @property
+    def linear(self) -> Tensor:
+        """Return the photo's linear radiance (H, W, 3) over black."""
+        image = srgb_decode(self.encoded)
+        return image if self.mask is None else image * (self.mask.float() / 255)[..., None]
 
     def over(self, background: Tensor) -> Tensor:
         """Composite the photo over a background (3,), sRGB-encoded (H, W, 3) and clipped to white."""

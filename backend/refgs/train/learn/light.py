@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from refgs.clock import timed
-from refgs.color import srgb_decode
 from refgs.model import cubemap
 from refgs.model.environment import Environment
 from refgs.render.mirrored_light import mirrored_light
@@ -23,6 +22,7 @@ LEAST_SIDE = 16  # texels along a side
 DIFFUSED = 64  # texels along a side for which `environment.diffusion` is given; with others, it reaches as far
 MEAN = 1 / 3  # base colour of things on average
 DARK = 1e-3  # radiance; the light never starts darker, though photos may be black
+SHOWN_VIEWS = 24  # photos that tell how bright the object is, at most
 MIRROR_VIEWS = 24  # views that tell which part of the light the object mirrors
 
 
@@ -49,10 +49,10 @@ def start_value(state: State) -> Tensor:
 def _shown(state: State) -> Tensor:
     """Return the object's mean radiance in some training photos, a scalar; of photos without masks, that of all pixels."""
     sums = []
-    for photo in spread(state.photos, MIRROR_VIEWS):
-        inside = torch.ones_like(photo.encoded[..., 0]) if photo.mask is None else photo.mask.float() / 255
-        shown = srgb_decode(photo.encoded).mean(dim=-1) * inside
-        sums.append(torch.stack([shown.sum(), inside.sum()]).double())
+    for photo in spread(state.photos, SHOWN_VIEWS):
+        linear = photo.linear
+        pixels = torch.ones_like(linear[..., 0]) if photo.mask is None else photo.mask.float() / 255
+        sums.append(torch.stack([linear.mean(dim=-1).sum(), pixels.sum()]).double())
     shown, pixels = torch.stack(sums).sum(dim=0)
     return shown / pixels.clamp_min(1e-6)
 

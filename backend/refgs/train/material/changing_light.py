@@ -51,8 +51,7 @@ def explained(observations: Observations, positions: Tensor, near: Tensor, radiu
     mean, change, known = averaged(observations, near)
     known &= known.sum(dim=1, keepdim=True) >= LEAST_VIEWS
     relative = (change.mean(dim=2) / mean.mean(dim=1, keepdim=True).clamp_min(1e-2)).clamp(-1, 2)
-    normal = observations.normal
-    smooth = torch.nn.functional.normalize(pooled(normal.flatten(1), near).view_as(normal), dim=2)
+    smooth = torch.nn.functional.normalize(pooled(observations.normal, near), dim=2)
     smoothed = observations._replace(normal=smooth)
     return _explained(smoothed, relative, known, positions / (CELL * radius))
 

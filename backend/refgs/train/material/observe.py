@@ -6,7 +6,6 @@ import torch
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 from torch import Tensor
 
-from refgs.color import srgb_decode
 from refgs.model import harmonics
 from refgs.model.environment import turn_between
 from refgs.model.surfels import Surfels
@@ -136,8 +135,7 @@ def observe_mirrored(state: State, inputs: RenderInputs, views: list[int]) -> Se
 def _sums(state: State, inputs: RenderInputs, view: int) -> Tensor:
     """Sum each surfel's pixels (N, 8): linear radiance, weights, clipped weights, and blended normals."""
     photo, factor = state.photo(view), exposure(state, view)
-    radiance = _linear(photo)
-    radiance = radiance if factor is None else radiance / factor
+    radiance = photo.linear if factor is None else photo.linear / factor
     one = torch.ones_like(radiance[..., :1])
     shown = torch.cat([radiance, one, _clipped(photo), probe.picture(state, view, inputs).normal], dim=-1)
     features = torch.ones_like(inputs.surfels.positions[:, :1]).expand(-1, 8)
@@ -148,12 +146,6 @@ def _towards(surfels: Surfels, photos: list[Photo]) -> Tensor:
     """Return the unit directions (N, V, 3) from surfels to the photos' cameras."""
     places = torch.stack([torch.from_numpy(photo.camera.position) for photo in photos]).to(surfels.positions)
     return torch.nn.functional.normalize(places - surfels.positions[:, None], dim=2)
-
-
-def _linear(photo: Photo) -> Tensor:
-    """Return a photo's linear radiance (H, W, 3) over black."""
-    image = srgb_decode(photo.encoded)
-    return image if photo.mask is None else image * (photo.mask.float() / 255)[..., None]
 
 
 def _clipped(photo: Photo) -> Tensor:
@@ -172,7 +164,7 @@ def _residuals(
     sums = []
     for number, photo in enumerate(photos):
         # Decode each photo anew: as floats, all together would take five times their memory.
-        target, lost = _linear(photo), _clipped(photo)
+        target, lost = photo.linear, _clipped(photo)
         features = torch.cat([mean * factor[:, number, None], torch.ones_like(mean[:, :2])], dim=1)
 
         def residual(shown: Tensor, target: Tensor = target, lost: Tensor = lost) -> Tensor:
@@ -216,7 +208,7 @@ def averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, 
     weight = observations.pixels * (observations.clipped < LEAST_CLIPPED) * (observations.pixels > LEAST_PIXELS)
     pixels = pooled(weight, near)
     known = pixels > LEAST_PIXELS
-    change = pooled((observations.change * weight[..., None]).flatten(1), near).view_as(observations.change)
+    change = pooled(observations.change * weight[..., None], near)
     change = torch.where(known[..., None], change / pixels.clamp_min(1e-6)[..., None], 0)
     seen = observations.pixels.sum(dim=1, keepdim=True)
     mean = (pooled(observations.mean * seen, near) / pooled(seen, near).clamp_min(1e-6)).clamp_min(1e-4)

@@ -134,11 +134,16 @@ def terms(seen: Seen, fits: mirrored.Mirrored, near: Tensor) -> dict[str, Tensor
 def _fall(radiance: Tensor, seen: Seen, near: Tensor) -> Tensor:
     """Compute how far below its median each surfel's `radiance` (N, V) falls in a tenth of the photos: a logarithm (N,), at least 0."""
     radiance = radiance.masked_fill(seen.weight <= 0, math.nan)
-    levels = torch.stack([radiance.nanquantile(of, dim=1).nan_to_num() for of in (LOW, 0.5)], dim=1)
+    levels = _low_and_median(radiance).T
     pixels = seen.pixels[:, None]
     low, median, total = pooled(torch.cat([levels * pixels, pixels], dim=1), near).unbind(dim=1)
     total = total.clamp_min(1e-6)
     return _log_ratio(median / total, low / total)
+
+
+def _low_and_median(radiance: Tensor) -> Tensor:
+    """Return the quantiles LOW and 1/2 of `radiance` (N, V) over the photos, (2, N). NaN stands for a photo that does not show it."""
+    return radiance.nanquantile(radiance.new_tensor([LOW, 0.5]), dim=1).nan_to_num()
 
 
 def _log_ratio(median: Tensor, low: Tensor) -> Tensor:
@@ -152,7 +157,7 @@ def _tint(seen: Seen, near: Tensor) -> tuple[Tensor, Tensor]:
     radiance over the photos.
     """
     pixels = pooled(seen.weight, near)
-    shown = pooled((seen.radiance * seen.weight[..., None]).flatten(1), near).view_as(seen.radiance)
+    shown = pooled(seen.radiance * seen.weight[..., None], near)
     known = (pixels > LEAST_PIXELS)[..., None]
     count = known.sum(dim=1).clamp_min(1)
     shown = shown / pixels.clamp_min(1e-6)[..., None] * known
@@ -181,7 +186,7 @@ def terms_of_changes(state: State, near: Tensor) -> dict[str, Tensor]:
     changes = explained(seen, state.learned["position"].detach(), near, state.capture.radius)
     mean, change, known = (each.cpu() for each in averaged(seen, near))
     shown = (mean[:, None] + change).mean(dim=2).clamp_min(0).masked_fill(~known, math.nan)
-    low, median = (shown.nanquantile(of, dim=1).nan_to_num() for of in (LOW, 0.5))
+    low, median = _low_and_median(shown)
     changing = max(0.0, changes.lit - changes.mirrored) if changes.lit >= 0 else 0.0  # NaN: nothing is known
     return {
         "fall of changes": _log_ratio(median, low),
