@@ -205,7 +205,6 @@ class LossSettings(_Section):
     even: float = Field(ge=0, description="edge-aware smoothness of metallic and roughness")
     alpha: float = Field(ge=0, description="agreement with the mask")
     metallic: float = Field(ge=0, description="penalty of metallic between 0 and 1, growing with progress²")
-    dark: float = Field(ge=0, description="penalty of metals darker than clean ones")
     matte: float = Field(ge=0, description="penalty of roughness above 0.3")
     light: float = Field(ge=0, description="penalty of a coloured mean of the light")
     prior: float = Field(
@@ -286,6 +285,7 @@ class Settings(_Section):
     mesh: MeshSettings
 
 
+REMOVED = (("loss", "dark"),)  # sections and keys that only runs of earlier releases have
 SHORT = {"primitive": "surfels.primitive"} | {key: f"render.{key}" for key in RenderSettings.model_fields}
 """Keys that `--set` takes without their section."""
 
@@ -347,13 +347,17 @@ def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
     """Make `Settings` from the tables of settings that a run recorded. `source` names their file in error messages.
 
     A run of an older release may lack a key. The key then gets the value that matches how that release worked, or the value of the preset
-    `standard`.
+    `standard`. Keys in REMOVED are dropped.
     """
     # Before these keys existed, light was fixed to the world, there were no exposures and no residual, and nothing was left out.
     still = {"light": {"frame": "world", "exposure": "off"}, "residual": {"start": 1.0}}
     still |= {"cameras": {"poses": "off"}, "image": {"coarse": "off"}, "loss": {"prior": 0.0}}
     still["needs"] = dict.fromkeys(NeedsSettings.model_fields, "on")
-    return validate(_merge(_merge(_read_preset("standard"), still), tables), source)
+    known = _merge(_merge(_read_preset("standard"), still), tables)
+    for section, key in REMOVED:
+        if isinstance(known[section], dict):
+            known[section].pop(key, None)
+    return validate(known, source)
 
 
 def validate(tables: dict[str, Any], source: str) -> Settings:

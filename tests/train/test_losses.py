@@ -18,7 +18,7 @@ from tests.makers import scenes
 from tests.makers.emulate import emulate
 from tests.makers.training import only
 
-DARK, FLAT = 0.1, 0.01
+FLAT = 0.01
 ALL = LossSettings(
     dssim=0.2,
     normal=0.3,
@@ -26,7 +26,6 @@ ALL = LossSettings(
     even=0.25,
     alpha=0.5,
     metallic=0.6,
-    dark=0.35,
     matte=0.7,
     light=0.0,
     prior=0.0,
@@ -77,9 +76,7 @@ def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress
     if rendering.material is not None:
         m, covered = rendering.metallic, (rendering.alpha.detach() > COVERED).sum().clamp_min(1)
         terms["metallic"] = weights.metallic * progress**2 * (m * (1 - m)).sum() / covered
-        dark = (1 - rendering.albedo.detach().amax(dim=-1) / DARK).clamp(0, 1)
         terms["matte"] = weights.matte * huber((rendering.roughness - 0.3).clamp_min(0)).sum() / covered
-        terms["dark metal"] = weights.dark * (dark * m).sum() / covered
     return terms
 
 
@@ -99,7 +96,6 @@ def pictures(width: int, height: int, masked: bool, material: bool) -> tuple[Ren
     normal = torch.tensor(camera.world_to_camera[2, :3] * -1).float() + 0.6 * (random(*size, 3) - 0.5)
     alpha = (random(*size) + 0.4).clamp_max(1) - 0.003 * random(*size)
     materials = random(*size, 5)
-    materials[::3, :, :3] *= DARK
     maps = [1.2 * random(*size, 3), alpha, depth * alpha, normal, materials if material else None]
     photo, mask = (torch.tensor((300 * rng.uniform(size=s)).clip(0, 255)).byte() for s in ((*size, 3), size))
     return Rendering(*maps), Photo(photo, mask if masked else None, camera)

@@ -4,7 +4,7 @@
 // Normals: 1 - N.n, N being the normal of the depth map and n the blended normal.
 // Smoothness: |grad n| exp(-|grad C_gt|); with the `even` weights also of metallic and roughness.
 // Mask: |alpha - mask|.
-// Metallic: m (1 - m), which is zero at 0 and at 1; and m on surfaces that are too dark for a metal.
+// Metallic: m (1 - m), which is zero at 0 and at 1.
 // Roughness: the excess above GLOSSY.
 //
 // A weight applies to one pixel's term.
@@ -20,8 +20,7 @@ struct Losses {
   const float* background;                                 // (3)
   float white, largest;                                    // codes: of 1; of a clipped pixel
   float rotation[9], across, down, left, top;              // world to camera; at depth 1: a pixel's size, the first pixel's position
-  float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, even_x_weight, even_y_weight, alpha_weight, metallic_weight, dark_weight,
-      matte_weight;
+  float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, even_x_weight, even_y_weight, alpha_weight, metallic_weight, matte_weight;
   float *photo, *clipped;   // (H, W, 3) the photo over the background; the clipped C, for D-SSIM
   const float* by_clipped;  // (H, W, 3) derivatives of D-SSIM by `clipped`
   float *by_color, *by_normal, *by_depth, *by_alpha, *by_material;
@@ -40,7 +39,6 @@ constexpr float SOLID = 0.5f, COVERED = 1 / 255.0f;  // least alpha of an opaque
 constexpr int MATERIAL = 5, METAL = 3, ROUGH = 4;    // channels of a material; the index of metallic, and of roughness
 constexpr float FLAT = 0.01f;                        // Huber threshold: smaller differences of metallic or roughness cost quadratically
 constexpr float GLOSSY = 0.3f;                       // roughness above this costs: only the photos can justify it
-constexpr float DARK = 0.1f;                         // every clean metal's base colour is brighter than this in some channel
 
 // LANES adjacent pixels of a row.
 struct Pixels {
@@ -253,14 +251,13 @@ KERNEL(refgs_losses_second, Losses, l) {
     if (!l.material) return;
     const float* material = r.of(l.material, MATERIAL);
     auto of_material = [&](int i) { return r.at.get(material + i, MATERIAL); };
-    Vector metallic = of_material(METAL), brightest = larger(larger(of_material(0), of_material(1)), of_material(2));
+    Vector metallic = of_material(METAL);
     float surfaces = (float)l.first[SURFACES], share_of_each = 1 / (surfaces > 1 ? surfaces : 1);
     float weight = share_of_each * l.metallic_weight;
-    Vector dark = share_of_each * l.dark_weight * clamp(1.0f - brightest * (1 / DARK), 0, 1);
     Vector matte = of_material(ROUGH) - GLOSSY, slope = clamp(matte * (1 / FLAT), 0, 1);  // Huber loss, as surfels may start at the kink
     Vector felt = share_of_each * l.matte_weight * slope;
-    r.add(sums[LOSS], weight * metallic * (1.0f - metallic) + dark * metallic + felt * (matte - 0.5f * FLAT * slope));
-    by_smooth[0] += weight * (1.0f - 2.0f * metallic) + dark, by_smooth[1] += felt;
+    r.add(sums[LOSS], weight * metallic * (1.0f - metallic) + felt * (matte - 0.5f * FLAT * slope));
+    by_smooth[0] += weight * (1.0f - 2.0f * metallic), by_smooth[1] += felt;
     float* row = r.of(l.by_material, MATERIAL);
     for (int i = 0; i < MATERIAL; i++) r.at.put(row + i, MATERIAL, i < METAL ? Vector() : by_smooth[i - METAL]);
   });

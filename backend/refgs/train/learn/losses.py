@@ -83,8 +83,7 @@ class _Objective(Function):
         if material is not None:
             work.even_x_weight, work.even_y_weight = weights.even / across, weights.even / down
         work.alpha_weight = weights.alpha / pixels
-        work.metallic_weight, work.dark_weight = weights.metallic * progress**2, weights.dark
-        work.matte_weight = weights.matte
+        work.metallic_weight, work.matte_weight = weights.metallic * progress**2, weights.matte
         work.dssim_weight, work.light_weight = structure_weight, weights.light
         by = {f"by_{name}": value for name, value in gradients.items()}
         work.attach(**inputs, **codes, **by, **buffers, sums=sums[0])
@@ -151,10 +150,9 @@ def objective(
       term, white balance drifts, because warm metal under neutral light looks almost like neutral metal under warm light.
     - Metallic m: m (1 − m), because real surfaces are either metal or not. The weight grows with the square of `progress`, because early in
       the training it is unknown which surfaces are metal.
-    - Dark metals: m times how much darker the surfel is than clean metals. A dark metal looks like dark glass.
     - Roughness: how much it exceeds 0.3. Without this term, it would grow where photos are clipped or show nothing bright: a blurred
       reflection fits there as well as a sharp one, even if normals are wrong.
     """
-    material = rendering.material if max(weights.metallic, weights.dark, weights.even, weights.matte) > 0 else None
+    material = rendering.material if max(weights.metallic, weights.even, weights.matte) > 0 else None
     maps = rendering.color, rendering.normal, rendering.blended_depth, rendering.alpha, material
     return Objective(*_Objective.apply(*maps, light, photo, background, weights, progress))
