@@ -1,8 +1,10 @@
-"""Make points of a ball that stands on a board, and what photos show of them."""
+"""Make points of a ball that stands on a board, what photos show of them, and what is reckoned from that."""
 
 import torch
 
-from refgs.train.material.observe import Seen
+from refgs.model.surfels import activate
+from refgs.train.material import reckoning, same_material
+from refgs.train.material.observe import NEIGHBOURS, Seen, neighbours
 
 
 def ball_on_board(count=4000):
@@ -28,3 +30,20 @@ def seen_as(points, normals, mean=None, shown=None):
     one = torch.ones(count, 1)
     pixels = 9 * (torch.ones(count) if shown is None else shown.float())
     return Seen(mean[:, None], 9 * one, pixels, mean, normals[:, None], normals[:, None])
+
+
+def reckoned(points, normals, metal, metallic, by_object=False):
+    """Make what `reckoning.reckon` returns, for probabilities `metal` (N,) and what the training has learned so far."""
+    count = len(points)
+    start = {"position": points, "albedo": torch.zeros(count, 3), "metallic": metallic, "roughness": torch.zeros(count)}
+    start |= {"rotation": torch.tensor([1.0, 0, 0, 0]).expand(count, 4), "scale": torch.zeros(count, 2)}
+    start |= {"opacity": torch.zeros(count), "received": torch.ones(count, 3), "sh_dc": torch.zeros(count, 1, 3)}
+    start |= {name: torch.zeros(count, 15, 3) for name in ("sh_rest", "indirect_rest")}
+    start["indirect_dc"] = torch.zeros(count, 1, 3)
+    start["albedo"][:, 0] = torch.where(points[:, 2] > 1, 2.0, -2.0)
+    start["roughness"] = torch.where(points[:, 2] > 1, -3.0, 0.0)
+    seen = seen_as(points, normals)
+    fitted = torch.full((count, 3), 0.8), torch.full((count,), 0.2), torch.full((count,), by_object)
+    graph = same_material.laplacian(points, seen, neighbours(points, NEIGHBOURS))
+    known = torch.ones(count, dtype=torch.bool)
+    return reckoning.Reckoned(metal, activate(start), seen, seen.pixels, *fitted, graph, {}, known)

@@ -13,11 +13,11 @@ from refgs.formats.splats import read_splats
 from refgs.model.surfels import activate, raw_metallic
 from refgs.train.keep.asset import write_asset
 from refgs.train.learn.densify import Densification, densify
-from refgs.train.material import metals, mirrored, questions, reckoning, same_material
+from refgs.train.material import metals, mirrored, questions, reckoning
 from refgs.train.material.observe import NEIGHBOURS, Seen, neighbours
 from refgs.train.trainer import ACTIONS
 from tests.makers.lamps import LAMPS, ORANGE, show
-from tests.makers.pieces import ball_on_board, seen_as
+from tests.makers.pieces import ball_on_board, reckoned
 from tests.makers.training import do, put
 from tests.makers.training import trainer as small
 
@@ -107,23 +107,6 @@ def test_a_metal_in_the_dark_is_told_by_what_it_mirrors_of_the_object(diffuse, r
     assert bool((fits.of_object.ratio < 0).all()) == metal
     if metal:
         assert torch.allclose(fits.of_object.reflectance, torch.tensor(reflectance), atol=0.03)
-
-
-def reckoned(points, normals, metal, metallic, by_object=False):
-    """Make what `reckoning.reckon` returns, for probabilities `metal` (N,) and what the training has learned so far."""
-    count = len(points)
-    start = {"position": points, "albedo": torch.zeros(count, 3), "metallic": metallic, "roughness": torch.zeros(count)}
-    start |= {"rotation": torch.tensor([1.0, 0, 0, 0]).expand(count, 4), "scale": torch.zeros(count, 2)}
-    start |= {"opacity": torch.zeros(count), "received": torch.ones(count, 3), "sh_dc": torch.zeros(count, 1, 3)}
-    start |= {name: torch.zeros(count, 15, 3) for name in ("sh_rest", "indirect_rest")}
-    start["indirect_dc"] = torch.zeros(count, 1, 3)
-    start["albedo"][:, 0] = torch.where(points[:, 2] > 1, 2.0, -2.0)
-    start["roughness"] = torch.where(points[:, 2] > 1, -3.0, 0.0)
-    seen = seen_as(points, normals)
-    fitted = torch.full((count, 3), 0.8), torch.full((count,), 0.2), torch.full((count,), by_object)
-    graph = same_material.laplacian(points, seen, neighbours(points, NEIGHBOURS))
-    known = torch.ones(count, dtype=torch.bool)
-    return reckoning.Reckoned(metal, activate(start), seen, seen.pixels, *fitted, graph, {}, known)
 
 
 def test_metals_are_as_the_metals_around_them():
@@ -243,6 +226,19 @@ def test_half_a_mirror_makes_all_of_it_metal(made):
     assert torch.allclose(found.albedo[left].median(dim=0)[0], half, atol=0.05)
     assert float(found.roughness[left].median()) == pytest.approx(1 / (1 + math.exp(3)), abs=0.02)
     assert "had been taken for paint" in state.decided["metals"]
+
+
+def test_metals_start_sharp(made):
+    """Check that metals that were learned as rough start over as sharp when they are found, but not at later looks."""
+    show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
+    state = made.state
+    shown = reckoning.reckon(state).shown
+    put(made, roughness=0.0)
+    do(state, "judge metals", 0.25, hidden=0.1)
+    assert float(state.surfels().roughness.detach()[shown].median()) == pytest.approx(0.5)
+    state.part(metals.Metals).found = False
+    do(state, "find metals", 0.25)
+    assert float(state.surfels().roughness.detach()[shown].median()) == pytest.approx(metals.SHARP)
 
 
 def test_paint_that_was_taken_for_metal_becomes_paint(made):

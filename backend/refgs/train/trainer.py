@@ -50,6 +50,7 @@ ACTIONS: dict[str, Callable[[State, Step], object]] = {
     "find metals": metals.find_metals,
     "judge metals": metals.judge,
     "even coloured metal out": even_metal.even_out,
+    "keep base colours' brightness": metals.keep_brightness,
     "prune and divide surfels": densify.prune_and_divide,
     "propagate normals": densify.propagate_normals,
     "reset opacities": densify.reset_opacity,

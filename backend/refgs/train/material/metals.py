@@ -5,12 +5,13 @@ starts near paint, so it would stay there. So whether a surfel is metal is recko
 at some new meshes. Where photos are sure, metallic values do not learn in between.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
 
-from refgs.model.surfels import raw_metallic
-from refgs.train.material import questions
+from refgs.model.surfels import Surfels, raw_metallic
+from refgs.train.material import brightness, questions
 from refgs.train.material.observe import Kinds
 from refgs.train.material.reckoning import like_metals, reckon
 from refgs.train.part import Part
@@ -21,17 +22,22 @@ GIVEN = Kinds(metal=0.9, paint=0.02)  # metallic that is set where photos are no
 HELD = Kinds(metal=0.98, paint=0.002)  # metallic that does not learn, in the order of `hints.KINDS`
 LIKELY = 1 - questions.DOUBTFUL / 2  # probability of metal, or of paint, from which on metallic is set
 SURE = 0.95  # probability from which on it does not learn
+SHARP = 0.1  # roughness from which metals learn, at most, once they are found
 TOLD = 0.005  # a change of a larger fraction of the surface is announced
 
 
 class Metals(Part):
-    """Remember in `found` whether metals have already been found."""
+    """Remember in `found` whether metals have already been found.
 
-    name, saved = "metals", ("found",)
+    `brightness` is the mean brightness that photos tell of those that are sure (see `brightness.told`), or None.
+    """
+
+    name, saved = "metals", ("found", "brightness")
     found = False
+    brightness: torch.Tensor | None = None
 
     def start(self, state: State) -> None:
-        self.found = False
+        self.found, self.brightness = False, None
         if "metallic" in state.learned:
             for name in ("held", "told"):
                 none = torch.zeros(state.learned.count, dtype=torch.bool, device=state.device)
@@ -45,7 +51,7 @@ def find_metals(state: State, step: Step) -> None:
     """
     if not state.part(Metals).found:
         state.part(Metals).found = True
-        _judge(state)
+        _judge(state, first=True)
 
 
 def judge(state: State, step: Step) -> None:
@@ -55,7 +61,7 @@ def judge(state: State, step: Step) -> None:
 
 
 @torch.no_grad()
-def _judge(state: State) -> None:
+def _judge(state: State, first: bool = False) -> None:
     """Set metallic to the kind that photos tell. It does not learn where they are sure, or where a hint holds it.
 
     A surfel that was taken for paint, but is metal, takes the base colour and roughness of the metals around it. An example is the lower
@@ -74,9 +80,17 @@ def _judge(state: State) -> None:
     if raised.any():
         material = torch.logit(like_metals(found).clamp(0.02, 0.98)).to(metallic.device)
         albedo[raised], roughness[raised] = material[raised, :3], material[raised, 3]
+    if (
+        first
+    ):  # a metal that learned to be rough under the first, blurred light would stay so; one that is too sharp learns
+        found_now = likely > LIKELY
+        roughness[found_now] = roughness[found_now].clamp_max(math.log(SHARP / (1 - SHARP)))
+        state.learned.forget("roughness", found_now)
     for name in names:
         state.learned.forget(name, raised | lowered)
     state.learned.forget("metallic", metal | paint)
+    surfels = Surfels(*(value.cpu() for value in state.surfels()))
+    state.part(Metals).brightness = brightness.told(surfels, found, _sure_kinds(state)[0].cpu())
     whole = max(float(found.pixels.sum()), 1e-6)
     kinds = state.surfels().metallic > 0.5, raised, lowered
     now, more, less = (float(found.pixels[which.cpu()].sum()) / whole for which in kinds)
@@ -128,6 +142,19 @@ def hold_as(state: State, kinds: torch.Tensor) -> None:
     state.learned["held"].copy_(kinds >= 0)
     state.learned.forget("metallic", kinds >= 0)
     state.part(Metals).found = True
+
+
+def keep_brightness(state: State, step: Step) -> None:
+    """Keep base colours as bright as what metals mirror of the object tells (see `brightness`)."""
+    mean = state.part(Metals).brightness
+    if mean is not None and {"albedo", "metallic"} <= state.learned.keys():
+        brightness.keep(state, *_sure_kinds(state), mean.to(state.device))
+
+
+def _sure_kinds(state: State) -> tuple[torch.Tensor, torch.Tensor]:
+    """Tell which surfels (N,) are metal, and which are paint, by hints or because photos are sure."""
+    sure, metal = state.learned["held"] | state.learned["told"], state.learned["metallic"] > raw_metallic(0.5)
+    return sure & metal, sure & ~metal
 
 
 def hold(state: State) -> None:
