@@ -10,7 +10,8 @@ from scipy.ndimage import map_coordinates
 
 from refgs.camera import Camera
 from refgs.capture.poses import OPENGL_TO_OPENCV
-from refgs.geometry.stereo import Photo, Shape
+from refgs.geometry import explain, field, fog
+from refgs.geometry.shape import Photo, Shape
 from tests.makers.distances import depth, gradient, rays_of
 
 
@@ -52,6 +53,14 @@ def grid(sdf, side: int = 96, half: float = 1.1) -> Shape:
 def half_ball(p: np.ndarray) -> np.ndarray:
     """Return the signed distance of points from the lower half of the unit ball: the visual hull of `bowl`."""
     return np.maximum(np.linalg.norm(p, axis=-1) - 1, p[..., 2])
+
+
+def carve_coarsely(monkeypatch) -> None:
+    """Make `carve_hollows` use few voxels, rays and iterations, for speed."""
+    monkeypatch.setattr(field, "SIDE", 64)
+    monkeypatch.setattr(fog, "ITERATIONS", 80)
+    monkeypatch.setattr(explain, "ITERATIONS", 80)
+    monkeypatch.setattr(explain, "RAYS", 4096)
 
 
 def write_capture(folder: Path, photos: list[Photo]) -> Path:

@@ -9,7 +9,7 @@ from refgs.settings import load_settings
 from refgs.train.plan import Plan
 from refgs.train.setup import set_up
 from tests.makers.distances import around
-from tests.makers.textured import bowl, photograph, write_capture
+from tests.makers.textured import bowl, carve_coarsely, photograph, write_capture
 
 LID = 0.1  # of the radius, under the rim
 
@@ -17,8 +17,13 @@ LID = 0.1  # of the radius, under the rim
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return write_capture(
-        tmp_path_factory.mktemp("speckled") / "bowl", [photograph(camera, bowl) for camera in around(48, 96)]
+        tmp_path_factory.mktemp("speckled") / "bowl", [photograph(camera, bowl) for camera in around(40, 96)]
     )
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch):
+    carve_coarsely(monkeypatch)
 
 
 def start(folder, run, *changes: str) -> tuple[np.ndarray, str]:

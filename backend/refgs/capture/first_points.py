@@ -11,8 +11,8 @@ from refgs.capture.images import LoadedView
 from refgs.capture.types import Capture
 from refgs.errors import InputError
 from refgs.geometry.hollows import carve_hollows
-from refgs.geometry.hull import visual_hull_points
-from refgs.geometry.stereo import Photo
+from refgs.geometry.hull import Carve, visual_hull_points
+from refgs.geometry.shape import Photo
 from refgs.settings import SurfelSettings
 
 AROUND = 0.5  # largest fraction of the points that may lie outside the region
@@ -40,9 +40,9 @@ def first_points(
     """Choose the points at which surfels start.
 
     If all photos have masks, most points lie on the visual hull of the masks. These points come first. The other points lie inside the
-    hull, because the object may have hollows, which masks do not show. With `hollows`, the hull is first carved where photos see through it
-    to a surface behind (see `hollows.carve_hollows`). This carving needs a light that does not move. If any photo has no mask, the points
-    are those of structure from motion, or random. There are at most `surfels.start` and at most `surfels.budget` points.
+    hull, because the object may have hollows, which masks do not show. With `hollows`, the hull is first carved where this explains photos
+    better (see `hollows.carve_hollows`). This carving needs a light that does not move. If any photo has no mask, the points are those of
+    structure from motion, or random. There are at most `surfels.start` and at most `surfels.budget` points.
     """
     count = min(surfels.start, surfels.budget)
     if all(view.alpha is not None for view in views):
@@ -70,20 +70,20 @@ def _hull_points(
     cameras = [view.camera for view in views]
     photos = [Photo(view.image, view.alpha, view.camera, view.white) for view in views if view.alpha is not None]
     alphas = [photo.alpha for photo in photos]  # all views have one
-    carve = partial(carve_hollows, photos=photos) if hollows else None
+    carve = partial(carve_hollows, photos=photos, seed=seed) if hollows else None
 
-    def within(radius: float) -> tuple:
+    def within(radius: float, carve: Carve | None) -> tuple:
         shown = max(1, count - round(surfels.inside * count))
         grid = {"resolution": surfels.hull, "seed": seed, "on_hull": shown, "carve": carve}
         found = visual_hull_points(alphas, cameras, capture.centre, radius, count, **grid)
         return *found, np.arange(count) < shown
 
     if capture.box is None:
-        *found, on_it = within(capture.radius)
+        *found, on_it = within(capture.radius, carve)
         return *found, int(on_it.sum())
-    around = within(capture.reach)
+    around = within(capture.reach, None)  # few points are used: not worth the seconds
     try:
-        near = within(capture.radius)
+        near = within(capture.radius, carve)
     except InputError:  # masks show an object, but only outside the box
         raise InputError("nothing that the masks show lies in the region: move its box, or enlarge it") from None
     chosen = _in_and_around(capture.box, near[0], around[0], count, seed)

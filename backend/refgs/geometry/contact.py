@@ -13,7 +13,7 @@ from skimage.measure import find_contours
 
 from refgs.camera import Camera
 from refgs.geometry.project import pixel_rays
-from refgs.geometry.stereo import Shape
+from refgs.geometry.shape import Shape
 
 STEP = 0.5  # voxels, along a ray
 ACROSS = 200  # pixels across the object, in the reduced masks

@@ -20,6 +20,8 @@ _LONE_CARVER = 0.15
 _FEWEST_VIEWS_TO_JUDGE = 8
 _HALF = 128  # of 255: a mask shows the object from there
 
+Carve = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
 
 def visual_hull_points(
     alphas: Sequence[np.ndarray],
@@ -30,7 +32,7 @@ def visual_hull_points(
     resolution: int = 96,
     seed: int = 0,
     on_hull: int | None = None,
-    carve: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None,
+    carve: Carve | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Spread `count` points on the visual hull of an object: the largest shape that fits into all masks.
 
