@@ -11,31 +11,31 @@ from tests.makers.training import trainer as small
 
 
 def ball(by_object):
-    """Return a metal ball of a third of its true base colour, on paint, and what was reckoned: the ball's reflectance is 0.8."""
+    """Return the base colours of a metal ball, a third of the true ones, on paint, and what was reckoned: it reflects 0.8."""
     points, normals, metal = ball_on_board()
     found = reckoned(points, normals, metal.float(), metal.float(), by_object)
     albedo = torch.where(metal[:, None], torch.tensor([0.8, 0.4, 0.2]) / 3, torch.tensor([0.6, 0.6, 0.6]))
-    return found.surfels._replace(albedo=albedo), found, metal
+    return albedo, found, metal
 
 
 def test_the_brightness_follows_from_what_metals_mirror_of_the_object():
-    surfels, found, metal = ball(True)
-    assert torch.allclose(brightness.told(surfels, found, metal).exp(), torch.tensor(0.8), atol=1e-3)
+    albedo, found, metal = ball(True)
+    assert torch.allclose(brightness.told(albedo, found, metal).exp(), torch.tensor(0.8), atol=1e-3)
 
 
 def test_a_few_surfels_that_mirror_the_object_tell_of_all():
-    surfels, found, metal = ball(False)
+    albedo, found, metal = ball(False)
     tenth = metal & (torch.arange(len(metal)) % 10 == 0)
     found = found._replace(by_object=tenth, reflectance=torch.where(tenth[:, None], 0.8, 0.1))
-    assert torch.allclose(brightness.told(surfels, found, metal).exp(), torch.tensor(0.8), atol=1e-3)
+    assert torch.allclose(brightness.told(albedo, found, metal).exp(), torch.tensor(0.8), atol=1e-3)
 
 
 def test_metals_that_mirror_no_object_are_left_alone():
-    surfels, found, metal = ball(False)
-    assert brightness.told(surfels, found, metal) is None
+    albedo, found, metal = ball(False)
+    assert brightness.told(albedo, found, metal) is None
     few = metal & (torch.arange(len(metal)) % 100 == 0)
-    assert brightness.told(surfels, found._replace(by_object=few), metal) is None
-    assert brightness.told(surfels, found, torch.zeros_like(metal)) is None, "nothing is metal"
+    assert brightness.told(albedo, found._replace(by_object=few), metal) is None
+    assert brightness.told(albedo, found, torch.zeros_like(metal)) is None, "nothing is metal"
 
 
 def test_only_the_mean_is_kept(large_ball, tmp_path):

@@ -9,9 +9,10 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, softplus
 
 from refgs.color import srgb_encode
+from refgs.formats.mesh import SmoothMesh
 from refgs.geometry.field import Field, sample
 from refgs.geometry.rays import Rays
-from refgs.geometry.visibility import Occluder
+from refgs.geometry.visibility import Occluder, mirror
 
 ITERATIONS = 150
 RAYS = 6144  # an iteration
@@ -32,8 +33,7 @@ class Explained:
 
     def __init__(self, shape: Field, rays: Rays, seed: int):
         self.rays, self.size = rays, torch.tensor(shape.values.shape)
-        mesh = shape.mesh()
-        self._trace(mesh, Occluder(mesh))
+        self._trace(shape.mesh())
         mean = rays.color.clamp(0.02, 1).mean(dim=0) ** 2.2
         cells = [max(2, round(n / CELL)) for n in shape.values.shape]
         # per cell: scattered radiance (3), tint of the mirrored radiance (3), and roughness
@@ -48,8 +48,9 @@ class Explained:
                 self.error[ids.numpy()] = self._errors(ids).clamp(max=WORST).numpy()
         self.mean = float(np.nanmean(self.error))
 
-    def _trace(self, mesh, occluder: Occluder) -> None:
+    def _trace(self, mesh: SmoothMesh) -> None:
         """Find where rays meet the shape, and where their mirrored rays meet it again."""
+        occluder = Occluder(mesh)
 
         def meet(origin, normal, direction):
             face, weights = occluder.meet(origin, normal, direction)
@@ -60,8 +61,7 @@ class Explained:
             # A smooth normal may point away from the ray where the face does not.
             normal -= direction * np.maximum((normal * direction).sum(axis=1, keepdims=True) + 0.02, 0)
             normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-            mirrored = direction - 2 * (direction * normal).sum(axis=1, keepdims=True) * normal
-            return face >= 0, point, normal, mirrored
+            return face >= 0, point, normal, mirror(direction, normal)
 
         origin, direction = self.rays.origin.numpy(), self.rays.direction.numpy()
         hit, point, normal, mirrored = meet(origin, np.zeros_like(origin), direction)

@@ -70,3 +70,8 @@ class Occluder:
             rays, directions = rays[back], directions[back]
             origins = origins[back] + (hit["tfar"][back, None] + 0.1 * lift) * directions
         return face, weights
+
+
+def mirror(directions, normals):
+    """Reflect directions (P, 3) at surfaces with unit normals (P, 3)."""
+    return directions - 2 * (directions * normals).sum(-1)[:, None] * normals

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
 from refgs.geometry.mesh import smooth_normals
-from refgs.geometry.visibility import Occluder
+from refgs.geometry.visibility import Occluder, mirror
 from refgs.model import cubemap, harmonics, prefilter
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
@@ -49,11 +49,6 @@ def sphere(count: int) -> np.ndarray:
 
 def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30)
-
-
-def mirror(directions, normals):
-    """Reflect directions (P, 3) at surfaces with unit normals (P, 3)."""
-    return directions - 2 * (directions * normals).sum(-1)[:, None] * normals
 
 
 def _split_sum(albedo: Tensor, metallic: Tensor, roughness: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:

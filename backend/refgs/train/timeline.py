@@ -23,7 +23,6 @@ RESET = 0.01  # opacity to which a reset lowers all surfels
 SEEN = 0.2
 # Parts of the training after which poses start to learn, are judged, and are frozen.
 POSES_FROM, POSES_KNOWN, POSES_UNTIL = 0.05, 0.3, 2 / 3
-KEPT_EVERY = 10  # iterations in which the brightness of metals may drift
 WHOLE_EVERY = 8  # one in this many iterations sees its whole photo, so that nothing stays beyond the margin of a crop
 REFLECTING = ("albedo", "metallic", "roughness", "indirect_dc", "indirect_rest", "environment", "exposure")
 PHOTO_STAGES = (0.35, 4), (0.7, 2)  # part of the training until which photos are reduced, and by what factor
@@ -293,7 +292,7 @@ AFTER = (
     DECIDE("find metals", part_after_initial(0.1) & iteration(100), RESIDUAL, only_if=METALS),
     Row("judge metals", until=RESIDUAL, only_if=JUDGED & FROM_HULL & METALS, clock="deciding"),
     Row("even coloured metal out", None, part(0.6), iterations(50)),
-    Row("keep base colours' brightness", None, part(0.6), iterations(KEPT_EVERY)),
+    Row("keep base colours' brightness", None, part(0.6), iterations(10)),
     Row("prune and divide surfels", setting("densify.start"), None, period("densify.every"), PRUNABLE),
     Row("propagate normals", every=period("propagation.every"), only_if=PROPAGATES, clock="densification"),
     Row("reset opacities", every=period("densify.reset_every"), only_if=RESETS),

@@ -22,8 +22,7 @@ LEAST_SIDE = 16  # texels along a side
 DIFFUSED = 64  # texels along a side for which `environment.diffusion` is given; with others, it reaches as far
 MEAN = 1 / 3  # base colour of things on average
 DARK = 1e-3  # radiance; the light never starts darker, though photos may be black
-SHOWN_VIEWS = 24  # photos that tell how bright the object is, at most
-MIRROR_VIEWS = 24  # views that tell which part of the light the object mirrors
+VIEWS = 24  # views that are looked at, at most: how bright the object is, and which part of the light it mirrors
 
 
 class MirroredLight(Part):
@@ -49,7 +48,7 @@ def start_value(state: State) -> Tensor:
 def _shown(state: State) -> Tensor:
     """Return the object's mean radiance in some training photos, a scalar; of photos without masks, that of all pixels."""
     sums = []
-    for photo in spread(state.photos, SHOWN_VIEWS):
+    for photo in spread(state.photos, VIEWS):
         linear = photo.linear
         pixels = torch.ones_like(linear[..., 0]) if photo.mask is None else photo.mask.float() / 255
         sums.append(torch.stack([linear.mean(dim=-1).sum(), pixels.sum()]).double())
@@ -114,7 +113,7 @@ def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
         return None
     mirrors = state.part(MirroredLight)
     if mirrors.weight is None or len(mirrors.weight) != len(light.radiance):
-        cameras = state.spread_cameras(MIRROR_VIEWS)
+        cameras = state.spread_cameras(VIEWS)
         with torch.no_grad():
             mirrors.weight = mirrored_light(state.surfels(), cameras, light, state.settings.render, state.near)
     return mirrors.weight @ light.radiance

@@ -16,7 +16,6 @@ import math
 import torch
 from torch import Tensor
 
-from refgs.model.surfels import Surfels
 from refgs.train.material.reckoning import Reckoned
 from refgs.train.state import State
 
@@ -27,13 +26,21 @@ PAINT = 0.4
 DARKEST, BRIGHTEST = 0.02, 0.98  # base colours
 
 
-def told(surfels: Surfels, found: Reckoned, metals: Tensor) -> Tensor | None:
-    """Return the mean brightness that photos tell of `metals` (N,), a scalar, or None if too little of them mirrors the object."""
+def plausible(color: Tensor) -> Tensor:
+    """Clamp base colours, or roughnesses with them, to DARKEST..BRIGHTEST: beyond, a logistic function hardly learns."""
+    return color.clamp(DARKEST, BRIGHTEST)
+
+
+def told(albedo: Tensor, found: Reckoned, metals: Tensor) -> Tensor | None:
+    """Return the mean brightness that photos tell of `metals` (N,), a scalar, or None if too little of them mirrors the object.
+
+    `albedo` (N, 3) are the base colours learned so far.
+    """
     weight = found.pixels * metals
     mirrors = weight * found.by_object
     if mirrors.sum() <= LEAST_PART * weight.sum():
         return None
-    learned = _brightness(surfels.albedo)
+    learned = _brightness(albedo)
     brighter = (mirrors * (_brightness(found.reflectance) - learned)).sum() / mirrors.sum()
     return learned[metals].mean() + brighter
 
@@ -53,8 +60,8 @@ def keep(state: State, metals: Tensor, paint: Tensor, brightness: Tensor) -> Non
 
     brighter, darker = brightness - mean(metals), (math.log(PAINT) - mean(paint)).clamp_max(0)
     changed = albedo * (metals * brighter + paint * darker).exp()[:, None]
-    raw.copy_(torch.where((metals | paint)[:, None], torch.logit(changed.clamp(DARKEST, BRIGHTEST)), raw))
+    raw.copy_(torch.where((metals | paint)[:, None], torch.logit(plausible(changed)), raw))
 
 
 def _brightness(color: Tensor) -> Tensor:
-    return color.amax(dim=1).clamp(DARKEST, BRIGHTEST).log()
+    return plausible(color).amax(dim=1).log()

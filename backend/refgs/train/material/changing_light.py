@@ -14,7 +14,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from refgs.render.relight import mirror, sphere
+from refgs.geometry.visibility import mirror
+from refgs.render.relight import sphere
 from refgs.train.material.observe import LEAST_PIXELS, LEAST_VIEWS, Observations, averaged, pooled
 
 SURFELS = 3000  # surfels that are looked at, at most

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import torch
 
-from refgs.model.surfels import Surfels, raw_metallic
+from refgs.model.surfels import raw_metallic
 from refgs.train.material import brightness, questions
 from refgs.train.material.observe import Kinds
 from refgs.train.material.reckoning import like_metals, reckon
@@ -78,23 +78,24 @@ def _judge(state: State, first: bool = False) -> None:
     metallic[metal], metallic[paint] = raw_metallic(HELD.metal), raw_metallic(HELD.paint)
     state.learned["told"].copy_(metal | paint)
     if raised.any():
-        material = torch.logit(like_metals(found).clamp(0.02, 0.98)).to(metallic.device)
+        material = torch.logit(brightness.plausible(like_metals(found))).to(metallic.device)
         albedo[raised], roughness[raised] = material[raised, :3], material[raised, 3]
-    if (
-        first
-    ):  # a metal that learned to be rough under the first, blurred light would stay so; one that is too sharp learns
-        found_now = likely > LIKELY
-        roughness[found_now] = roughness[found_now].clamp_max(math.log(SHARP / (1 - SHARP)))
-        state.learned.forget("roughness", found_now)
+    if first:
+        # The first light is blurred. A metal that became rough under it would stay so, while one that is too sharp learns.
+        fresh = likely > LIKELY
+        roughness[fresh] = roughness[fresh].clamp_max(math.log(SHARP / (1 - SHARP)))
+        state.learned.forget("roughness", fresh)
     for name in names:
         state.learned.forget(name, raised | lowered)
     state.learned.forget("metallic", metal | paint)
-    surfels = Surfels(*(value.cpu() for value in state.surfels()))
-    state.part(Metals).brightness = brightness.told(surfels, found, _sure_kinds(state)[0].cpu())
+    now = state.surfels()
+    state.part(Metals).brightness = brightness.told(now.albedo.cpu(), found, _sure_kinds(state)[0].cpu())
     whole = max(float(found.pixels.sum()), 1e-6)
-    kinds = state.surfels().metallic > 0.5, raised, lowered
-    now, more, less = (float(found.pixels[which.cpu()].sum()) / whole for which in kinds)
-    words = f"{now:.0%} of the surface is metal: {more:.1%} had been taken for paint, and {less:.1%} is paint after all"
+    kinds = now.metallic > 0.5, raised, lowered
+    metals, more, less = (float(found.pixels[which.cpu()].sum()) / whole for which in kinds)
+    words = (
+        f"{metals:.0%} of the surface is metal: {more:.1%} had been taken for paint, and {less:.1%} is paint after all"
+    )
     state.announce("metals", words, detail=max(more, less) < TOLD)
 
 

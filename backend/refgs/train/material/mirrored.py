@@ -16,12 +16,12 @@ from torch import Tensor
 
 from refgs.formats.mesh import Mesh
 from refgs.geometry.mesh import smooth_normals
-from refgs.geometry.visibility import Occluder
+from refgs.geometry.visibility import Occluder, mirror
 from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render.brdf import look_up
-from refgs.render.relight import blend, mirror
+from refgs.render.relight import blend
 from refgs.train import probe
 from refgs.train.material.observe import GRAZING, OBSERVED_VIEWS, Seen, observe_mirrored, pooled
 from refgs.train.state import State
