@@ -72,7 +72,8 @@ def write_asset(run: Path, picture: Path | None, file: Path) -> None:
     collection = import_run(run, scene).collection
     if own := cameras(collection):
         bpy.data.batch_remove([*own.objects, own])
-    scene.world = None
+    if scene.world is not None:
+        bpy.data.worlds.remove(scene.world)
     correct_diffuse(scene)  # the next scene has another world
     bpy.data.orphans_purge(do_recursive=True)
     bpy.ops.file.pack_all()

@@ -40,6 +40,7 @@ def contact_sheet(
     if not png.parent.is_dir():  # Blender would create it
         raise InputError(f"cannot write {png}: its folder does not exist")
     before = get_light(world) if is_panorama(world) else None
+    kept = world is not None and world.use_fake_user
     pictures = []
     try:
         with tempfile.TemporaryDirectory() as folder:
@@ -54,8 +55,10 @@ def contact_sheet(
         if before is not None:
             set_light(world, *before)
             correct_diffuse(scene)
-        elif lit is not None:
+        elif lit != world:
             bpy.data.worlds.remove(lit)
+            if world is not None:
+                world.use_fake_user = kept
     progress(len(lights), "layout")
     height, width = pictures[0].shape[:2]
     columns = max(1, round((len(pictures) * height / width) ** 0.5))

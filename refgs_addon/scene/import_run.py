@@ -18,7 +18,7 @@ from .color_spaces import LINEAR_REC709, SRGB, set_color_space
 from .place_run import extent
 from .run_toml import capture_of
 from .splat_cloud import add_splats, cloud_attributes, normal_slopes, point_cloud, read_constants, read_splats
-from .world_light import correct_diffuse, light_with_recovered, load_panorama
+from .world_light import correct_diffuse, keep_world, light_with_recovered, load_panorama
 
 LAYERS = 64  # transparent quads that a ray passes in Cycles: 16 left splats a tenth too dark and blotched, 256 showed no more
 DEPTH = 0.005  # of a mesh under the splats, as a part of the run's longest side
@@ -47,11 +47,11 @@ class Run:
 def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     """Import a run folder, the result of a training, into a scene, as a new collection `RefGS NAME`.
 
-    splats.ply must exist. mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be missing. If there is a mesh,
-    it is shown and the splats are hidden: Blender shades each splat by itself, which looks grainy on polished surfaces. `run_parts.show`
-    switches between the two. The cameras are hidden. An Empty is the parent of all objects. `trace_rays` sets up Eevee and Cycles. If
-    `capture_cameras.show_cameras` added the cameras of the same capture, the run's cameras replace them. If this function raises
-    InputError, it leaves the open file unchanged.
+    splats.ply must exist. mesh.glb, environment.exr and cameras.json may be missing. The light becomes the scene's world, and the file
+    keeps the old world. If there is a mesh, it is shown and the splats are hidden: Blender shades each splat by itself, which looks grainy
+    on polished surfaces. `run_parts.show` switches between the two. The cameras are hidden. An Empty is the parent of all objects.
+    `trace_rays` sets up Eevee and Cycles. If `capture_cameras.show_cameras` added the cameras of the same capture, the run's cameras
+    replace them. If this function raises InputError, it leaves the open file unchanged.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -99,6 +99,8 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
         scene.world, scene.camera = world, camera
         bpy.data.batch_remove(data_blocks() - before)
         raise
+    if scene.world != world:
+        keep_world(world)
     trace_rays(scene)
     if capture is not None and frames:
         replace_cameras(scene, capture, run.cameras)

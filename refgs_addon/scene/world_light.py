@@ -35,8 +35,9 @@ def load_panorama(path: Path) -> bpy.types.Image:
 
 
 def light_with_recovered(scene: bpy.types.Scene, name: str, image: bpy.types.Image) -> bpy.types.World:
-    """Give the scene a new world with `image`, the panorama of a run's recovered light."""
+    """Give the scene a new world with `image`, the panorama of a run's recovered light. The file keeps it when it is not used, too."""
     world = panorama_world(name)
+    world.use_fake_user = True
     world[RECOVERED] = image
     world.node_tree.nodes[IMAGE].image = image
     scene.world = world
@@ -47,13 +48,14 @@ def relight(scene: bpy.types.Scene, hdri: Path | None, rotation: float = 0.0, st
     """Light the scene with an HDRI. With `hdri` None, light it again with the panorama recovered from the run's photos.
 
     `rotation` rotates the environment about z, in radians, counter-clockwise seen from above; `strength` multiplies its radiance. The
-    scene's world remembers the recovered panorama. A world that RefGS did not make is not changed: the scene gets a new one. Raises
-    InputError if the HDRI cannot be read, or there is no recovered panorama.
+    scene's world remembers the recovered panorama. A world that RefGS did not make is not changed: the scene gets a new one, and the file
+    keeps the old one. Raises InputError if the HDRI cannot be read, or there is no recovered panorama.
     """
     world = scene.world if is_panorama(scene.world) else None
     if hdri is not None:
         image = load_panorama(hdri)
         if world is None:
+            keep_world(scene.world)
             world = scene.world = panorama_world("RefGS Light")
     elif world is not None and world.get(RECOVERED) is not None:
         image = world[RECOVERED]
@@ -61,6 +63,12 @@ def relight(scene: bpy.types.Scene, hdri: Path | None, rotation: float = 0.0, st
         raise InputError("this scene has no recovered light: import a RefGS run that has one")
     set_light(world, image, (0.0, 0.0, rotation), strength)
     correct_diffuse(scene)
+
+
+def keep_world(world: bpy.types.World | None) -> None:
+    """Make Blender save a world that no scene uses any more."""
+    if world is not None:
+        world.use_fake_user = True
 
 
 def match_light(scene: bpy.types.Scene) -> None:

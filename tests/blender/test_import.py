@@ -26,6 +26,7 @@ from refgs_addon.scene.regions import REGION
 from refgs_addon.scene.run_parts import cameras, parts, show
 from refgs_addon.scene.run_toml import newer_release
 from refgs_addon.scene.splat_cloud import MATERIALS, normal_slopes, read_splats
+from refgs_addon.scene.world_light import relight
 from tests.makers.blender import attribute, evaluated_mesh
 from tests.makers.box import rewrite_glb
 from tests.makers.distances import spread
@@ -410,6 +411,19 @@ def test_importing_twice_gives_two_runs(run, run_folder, scene):
     assert list(second.cameras) == ["front", "shifted"] and scene.world == second.world
 
 
+def test_all_worlds_are_saved_with_the_file(run_folder, scene, tmp_path):
+    """Check that saving keeps the artist's own world, and the lights of runs that are not shown."""
+    scene.world = bpy.data.worlds.new("the artist's own")
+    names = [scene.world.name, *(import_run(run_folder, scene).world.name for _ in range(2))]
+    scene.world = bpy.data.worlds[names[0]]
+    relight(scene, run_folder / "environment.exr")
+    names.append(scene.world.name)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert names == ["the artist's own", "RefGS pot", "RefGS pot.001", "RefGS Light"]
+    assert {world.name for world in bpy.data.worlds} == set(names)
+
+
 def test_optional_parts_may_be_missing(run_folder, scene):
     for name in ("mesh.glb", "environment.exr", "cameras.json"):
         (run_folder / name).unlink()
@@ -489,12 +503,13 @@ def names_another_file(path):
 )
 def test_a_broken_folder_leaves_nothing_behind(run_folder, scene, name, spoil, says):
     spoil(run_folder / name)
+    own = scene.world = bpy.data.worlds.new("the artist's own")
     before = set(bpy.data.user_map())  # all data-blocks, of every kind
     with pytest.raises(InputError, match=says) as error:
         import_run(run_folder, scene)
     assert "\n" not in str(error.value) and name in str(error.value)
     assert set(bpy.data.user_map()) == before
-    assert scene.world is None and scene.camera is None
+    assert scene.world == own and not own.use_fake_user and scene.camera is None
 
 
 def test_a_run_stands_beside_what_was_in_its_place(run_folder, addon):

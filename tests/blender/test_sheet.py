@@ -50,3 +50,8 @@ def test_without_lights_or_a_place_to_write(run_folder, scene, tmp_path):
     with pytest.raises(InputError, match="cannot write"):
         contact_sheet(scene, tmp_path / "not there" / "a.png", [tmp_path / "grey.exr"], size=8, samples=1)
     assert scene.world is None and not bpy.data.worlds
+    own = scene.world = bpy.data.worlds.new("the artist's own")
+    contact_sheet(scene, tmp_path / "a.png", [tmp_path / "grey.exr"], size=8, samples=1)
+    with pytest.raises(InputError, match="cannot read the light"):
+        contact_sheet(scene, tmp_path / "a.png", [tmp_path / "not there.exr"], size=8, samples=1)
+    assert [*bpy.data.worlds] == [scene.world] == [own] and not own.use_fake_user
