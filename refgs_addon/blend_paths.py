@@ -9,13 +9,14 @@ from collections.abc import Callable, Iterator
 
 import bpy
 
+from .nodes.panorama_world import get_light, is_panorama
 from .scene.camera_objects import MASK, PHOTO
 from .scene.capture_cameras import CAPTURE
 from .scene.run_parts import FOLDER
 from .scene.strokes import STROKES
 
 
-def _change(change: Callable[[str], str]) -> None:
+def change_paths(change: Callable[[str], str]) -> None:
     """Apply `change` to each path that the add-on stores in the open file."""
     for item, key in _custom_properties():
         item[key] = change(item[key])
@@ -46,9 +47,15 @@ def _absolute(path: str, start: str) -> str:
 
 
 def _relative(path: str, start: str) -> str:
+    """Return an absolute path relative to the folder `start`, or as it is if it is on another drive."""
+    if not os.path.isabs(path):
+        return path
     try:
-        return bpy.path.relpath(path, start=start) if os.path.isabs(path) else path
-    except ValueError:  # on another drive
+        relative = bpy.path.relpath(path, start=start)
+        # Through a symbolic link or a mapped drive, a path into the project can look like one out of it, and a copy would use the original.
+        real = bpy.path.relpath(os.path.realpath(path), start=os.path.realpath(start))
+        return real if relative.startswith("//..") and not real.startswith("//..") else relative
+    except ValueError:
         return path
 
 
@@ -58,21 +65,24 @@ def _before_saving(file: str, *_) -> None:
     if before:
         # Blender makes the paths of images relative when a file is saved first, and then keeps relative ones right.
         runs = tuple(os.path.join(item[key], "") for item, key in _custom_properties() if key == FOLDER)
+        photos = {item[key] for item, key in _custom_properties() if key == PHOTO}
+        lights = {get_light(world)[0] for world in bpy.data.worlds if is_panorama(world)}
         for image in bpy.data.images:
-            if image.library is None and image.filepath.startswith(runs):
+            ours = image.filepath.startswith(runs) or image.filepath in photos or image in lights
+            if image.library is None and ours:
                 image.filepath_raw = _relative(image.filepath, before)
     if after:  # else it is the startup file
-        _change(lambda path: _relative(_absolute(path, before), after))
+        change_paths(lambda path: _relative(_absolute(path, before), after))
 
 
 @bpy.app.handlers.persistent
 def _after_saving(file: str, *_) -> None:
-    _change(lambda path: _absolute(path, os.path.dirname(file)))
+    change_paths(lambda path: _absolute(path, os.path.dirname(file)))
 
 
 @bpy.app.handlers.persistent
 def _after_loading(*_) -> None:
-    _change(lambda path: _absolute(path, os.path.dirname(bpy.data.filepath)))
+    change_paths(lambda path: _absolute(path, os.path.dirname(bpy.data.filepath)))
 
 
 @bpy.app.handlers.persistent

@@ -17,7 +17,7 @@ from .atomic_file import atomic_write
 from .color_spaces import to_rec709
 from .edit import edits, is_edited, splats_of
 from .mesh_exchange import TEXTURES, write_mesh
-from .run_parts import FOLDER
+from .run_parts import FOLDER, folder_of
 from .splat_cloud import MATERIALS, SH_DC, finite_rows, read_constants, srgb_to_linear
 
 KEPT = ("environment.exr", "cameras.json", "needs.json", "occluder.ply", "run.toml")
@@ -162,9 +162,10 @@ def _copy(file: Path, path: Path) -> None:
 
 def run_folder(collection: bpy.types.Collection) -> Path:
     """Find the run folder of an imported collection. Raises InputError where it is missing."""
-    folder = Path(bpy.path.abspath(collection.get(FOLDER, "")))
-    if not collection.get(FOLDER) or not (folder / "splats.ply").is_file():
-        raise InputError(f"the run of {collection.name} is no longer at {folder}: import it again from its new place")
+    folder = folder_of(collection)
+    if folder is None:
+        lost = bpy.path.abspath(collection.get(FOLDER, ""))
+        raise InputError(f"the run of {collection.name} is no longer at {lost}: press Find Run Folder in the panel Run")
     return folder
 
 

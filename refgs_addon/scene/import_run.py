@@ -1,5 +1,6 @@
 """Import a run folder, the result of a training: its splats, mesh and cameras, and the light recovered from the photos."""
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -48,22 +49,25 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     """Import a run folder, the result of a training, into a scene, as a new collection `RefGS NAME`.
 
     splats.ply must exist. mesh.glb, environment.exr and cameras.json may be missing. The light becomes the scene's world, and the file
-    keeps the old world. If there is a mesh, it is shown and the splats are hidden: Blender shades each splat by itself, which looks grainy
-    on polished surfaces. `run_parts.show` switches between the two. The cameras are hidden. An Empty is the parent of all objects.
-    `trace_rays` sets up Eevee and Cycles. If `capture_cameras.show_cameras` added the cameras of the same capture, the run's cameras
-    replace them. If this function raises InputError, it leaves the open file unchanged.
+    keeps the old world; the panorama is packed into it. If there is a mesh, it is shown and the splats are hidden: Blender shades each
+    splat by itself, which looks grainy on polished surfaces. `run_parts.show` switches between the two. The cameras are hidden. An Empty is
+    the parent of all objects. `trace_rays` sets up Eevee and Cycles. If `capture_cameras.show_cameras` added the cameras of the same
+    capture, the run's cameras replace them. If this function raises InputError, it leaves the open file unchanged.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: choose the folder that a RefGS run wrote")
-    name = folder.resolve().name
+    folder = Path(
+        os.path.abspath(folder)
+    )  # not resolved: by a link's target, a copied project would find the original's run
+    name = folder.name
     splats, left_out = read_splats(folder / "splats.ply")
     capture = capture_of(folder)
     frames = read_cameras(folder / "cameras.json", capture) if (folder / "cameras.json").exists() else []
     before, world, camera = data_blocks(), scene.world, scene.camera
     try:
         collection = bpy.data.collections.new(f"RefGS {name}")
-        collection[run_parts.FOLDER] = str(folder.resolve())
+        collection[run_parts.FOLDER] = str(folder)
         if words := _doubt_words(folder):
             collection[run_parts.DOUBT] = words
         scene.collection.children.link(collection)
@@ -75,6 +79,7 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
         if (folder / "environment.exr").exists():
             light = load_panorama(folder / "environment.exr")
             run.light_is_rec709 = set_color_space(light, LINEAR_REC709)
+            light.pack()  # the .blend keeps it where the run folder is moved or deleted
             run.world = light_with_recovered(scene, f"RefGS {name}", light)
             run.light_of = light_of(folder / "cameras.json") if frames else ""
             if run.light_of:

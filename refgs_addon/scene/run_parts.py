@@ -1,5 +1,7 @@
 """Find the parts of an imported run: its splats and mesh, the Empty that moves them, its cameras. Show the splats or the mesh."""
 
+from pathlib import Path
+
 import bpy
 
 KEY = "refgs_part"  # custom property of an imported object: "splats" or "mesh"
@@ -27,6 +29,12 @@ def root(collection: bpy.types.Collection) -> bpy.types.Object | None:
 def cameras(collection: bpy.types.Collection) -> bpy.types.Collection | None:
     """Find the collection of a run's cameras. Returns None if the run has none."""
     return next((child for child in collection.children if CAMERAS in child), None)
+
+
+def folder_of(collection: bpy.types.Collection) -> Path | None:
+    """Return an imported run's folder, or None if it is no longer where it was."""
+    folder = Path(bpy.path.abspath(collection.get(FOLDER, "")))
+    return folder if collection.get(FOLDER) and (folder / "splats.ply").is_file() else None
 
 
 def show(collection: bpy.types.Collection, part: str) -> None:

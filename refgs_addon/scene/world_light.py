@@ -61,8 +61,17 @@ def relight(scene: bpy.types.Scene, hdri: Path | None, rotation: float = 0.0, st
         image = world[RECOVERED]
     else:
         raise InputError("this scene has no recovered light: import a RefGS run that has one")
+    _check_image(world, image)
     set_light(world, image, (0.0, 0.0, rotation), strength)
     correct_diffuse(scene)
+
+
+def _check_image(world: bpy.types.World, image: bpy.types.Image | None) -> None:
+    """Raise InputError if a panorama's file is missing, and the panorama is not packed into the .blend."""
+    if image is None or min(image.size) == 0:
+        fix = "press Find Run Folder in the panel Run" if image == world.get(RECOVERED) else "choose the HDRI again"
+        name = bpy.path.abspath(image.filepath) if image else "the world's image"
+        raise InputError(f"{name} does not exist: {fix}")
 
 
 def keep_world(world: bpy.types.World | None) -> None:
@@ -83,6 +92,8 @@ def match_light(scene: bpy.types.Scene) -> None:
     image, _, _ = get_light(world)
     if image == world[RECOVERED]:
         raise InputError("the scene is lit by the recovered light: choose an HDRI first, then match it")
+    for panorama in (image, world[RECOVERED]):
+        _check_image(world, panorama)
     from .panorama import best_rotation  # needs numpy, which Debian's Blender may lack
 
     rotation, scale = best_rotation(image, world[RECOVERED])

@@ -1,6 +1,7 @@
 """Draw the Light panel, in which the artist chooses the panorama that lights the scene."""
 
 import math
+import os
 from pathlib import Path
 
 import bpy
@@ -54,7 +55,7 @@ def _shown(world: bpy.types.World | None, files: list[Path]) -> int:
         return OTHER
     if image == world.get(RECOVERED):
         return RECOVERED_LIGHT
-    number = _number(Path(bpy.path.abspath(image.filepath)))
+    number = _number(Path(os.path.normpath(bpy.path.abspath(image.filepath))))
     return number if any(_number(file) == number for file in files) else OTHER
 
 

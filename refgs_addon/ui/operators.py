@@ -139,6 +139,28 @@ class ImportRun(ReportsErrors, bpy.types.Operator):
         import_run_folder(self, context, Path(bpy.path.abspath(self.directory)))
 
 
+class FindRun(OnRunFolder, bpy.types.Operator):
+    bl_idname = "refgs.find_run"
+    bl_label = "Find Run Folder"
+    bl_description = (
+        "Choose the folder of this run, if it was moved, renamed or copied: all paths to it follow, and edits stay"
+    )
+
+    directory: StringProperty(name="New Folder", subtype="DIR_PATH")
+    filter_folder: BoolProperty(default=True, options={"HIDDEN"})
+
+    def invoke(self, context, event):
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def work(self, context: bpy.types.Context) -> None:
+        from ..scene.find_run import find_run
+
+        old, folder = Path(self.folder), Path(bpy.path.abspath(self.directory))
+        find_run(old, folder)
+        self.report({"INFO"}, f"{old.name} is in {folder}")
+
+
 class ShowPart(ReportsErrors, bpy.types.Operator):
     bl_idname = "refgs.show"
     bl_label = "Show"
@@ -348,5 +370,5 @@ class ContactSheet(_Render, bpy.types.Operator):
             render_in_background(context.scene, png, lights, self.size, self.samples)
 
 
-CLASSES = (ImportRun, ShowPart, SetDetail, Crop, DeleteSplats, RestoreSplats, NextCamera, Photo, Turntable)
+CLASSES = (ImportRun, FindRun, ShowPart, SetDetail, Crop, DeleteSplats, RestoreSplats, NextCamera, Photo, Turntable)
 CLASSES += (RenderPreview, ContactSheet, MarkAsset)

@@ -16,7 +16,7 @@ from .checked_capture import draw_capture
 from .closing import KeepTraining, StopRun
 from .decisions_box import draw_decisions
 from .icons import curve_icon, preview_icon
-from .operators import OnCapture, OnJob, OnRunFolder, ReportsErrors, import_run_folder, select_only
+from .operators import FindRun, OnCapture, OnJob, OnRunFolder, ReportsErrors, import_run_folder, select_only
 from .panels import Tab
 from .photo_buttons import MakeMasks, PaintStrokes, PhotosFromVideo, SaveStrokes
 
@@ -325,6 +325,7 @@ def _draw_run(box: bpy.types.UILayout, scene: bpy.types.Scene, folder: Path, wid
         row.label(text=f"{folder.name} is being trained", icon="SORTTIME")
     else:
         row.label(text=f"{folder.name} does not exist", icon="GHOST_DISABLED")
+        row.operator(FindRun.bl_idname, text="", icon="FILE_FOLDER").folder = str(folder)
     row.operator(RemoveFromList.bl_idname, text="", icon="X").folder = str(folder)
     if state == "training":
         follow_other_processes()

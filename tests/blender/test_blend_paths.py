@@ -6,6 +6,7 @@ import shutil
 import bpy
 import pytest
 
+from refgs_addon.scene.camera_objects import show_photo
 from refgs_addon.scene.export_run import run_folder as folder_of
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.run_parts import FOLDER
@@ -89,6 +90,36 @@ def test_the_light_of_a_run_that_was_imported_later_is_relative(project, tmp_pat
     (tmp_path / "else").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "else" / "a.blend"))
     assert image.filepath == "//../project/runs/vase/environment.exr"
+
+
+@pytest.mark.parametrize("by", ["link", "place"])
+def test_a_project_behind_a_symbolic_link_is_copied_whole(project, tmp_path, by):
+    """Check that a copy does not work in the original's run where the run was imported by another path than the .blend was opened."""
+    link = tmp_path / "link"
+    link.symlink_to(project)
+    write_run(project / "runs" / "vase")
+    top, other = (link, project) if by == "link" else (project, link)
+    bpy.ops.wm.open_mainfile(filepath=str(top / "scene.blend"))
+    for path in (top, other):
+        import_run(path / "runs" / "vase", bpy.context.scene)
+    bpy.ops.wm.save_mainfile()
+    copied = shutil.copytree(project, tmp_path / "elsewhere" / "deep" / "copy")
+    bpy.ops.wm.open_mainfile(filepath=str(copied / "scene.blend"))
+    folders = [item[FOLDER] for item in bpy.data.collections if FOLDER in item]
+    assert folders == [str(copied / "runs" / name) for name in ("pot", "vase", "vase")]
+
+
+def test_a_photo_that_was_shown_later_is_relative(project):
+    camera = next(item for item in bpy.data.objects if item.type == "CAMERA")
+    photo = project / "photos" / "images" / "0001.jpg"
+    photo.parent.mkdir()
+    image = bpy.data.images.new("photo", 4, 4)
+    image.file_format, image.filepath_raw = "JPEG", str(photo)
+    image.save()
+    bpy.data.images.remove(image)
+    show_photo(camera)
+    bpy.ops.wm.save_mainfile()
+    assert camera.data.background_images[0].image.filepath == "//photos/images/0001.jpg"
 
 
 def test_saving_elsewhere_keeps_the_run(project, tmp_path):

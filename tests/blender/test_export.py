@@ -97,7 +97,7 @@ def test_what_is_not_there_is_said_in_one_line(run, run_folder, tmp_path):
     with pytest.raises(InputError, match="has no light"):
         export_light(run.collection, tmp_path / "a.exr")
     shutil.rmtree(run_folder)
-    with pytest.raises(InputError, match="import it again from its new place"):
+    with pytest.raises(InputError, match="press Find Run Folder"):
         export_splats(run.collection, tmp_path / "a.ply")
     assert list(tmp_path.iterdir()) == []
 

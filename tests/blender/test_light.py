@@ -106,6 +106,20 @@ def test_the_chooser_says_and_sets_what_lights_the_scene(run_folder, addon, monk
     assert nodes[IMAGE].image.name == "environment.exr" and strength.default_value == 1.0
 
 
+def test_a_light_is_known_by_its_relative_path(addon, monkeypatch, tmp_path):
+    """Check that a light that was chosen after the first save is stored relative to the .blend, and that the chooser knows it."""
+    for folder in ("hdris", "project"):
+        (tmp_path / folder).mkdir()
+    file = tmp_path / "hdris" / "room.exr"
+    write_panorama(file, np.ones((8, 16, 3)))
+    monkeypatch.setattr(light_panel, "hdri_folder", lambda: file.parent)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "project" / "a.blend"))
+    relight(addon, file)
+    bpy.ops.wm.save_mainfile()
+    assert addon.world.node_tree.nodes[IMAGE].image.filepath == "//../hdris/room.exr"
+    assert bpy.context.window_manager.refgs_light == str(file)
+
+
 def half_sky(height=32):
     """Draw a panorama whose side towards +x is bright and orange, and whose other side is dim: (height, 2 × height, 3)."""
     azimuth = math.pi * (1 - 2 * (np.arange(2 * height) + 0.5) / (2 * height))
