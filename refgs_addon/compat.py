@@ -4,7 +4,7 @@ import bpy
 
 EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
 
-# How Eevee weakens the directional part of the world's diffuse light: see `scene.panorama.diffuse_light`.
+# How Eevee weakens the directional part of the world's diffuse light: see `nodes.world_diffuse`.
 EEVEE_WINDOW_BY_LENGTH = bpy.app.version >= (5, 1, 0)
 
 # Image settings of a file format, in the order to set them; from 5.0 a format belongs to a medium.

@@ -9,15 +9,19 @@ bright. The group multiplies the base colour by the true irradiance, and divides
 from collections.abc import Sequence
 
 import bpy
+from mathutils import Euler, Vector
 
-from ..compat import EEVEE
+from ..compat import EEVEE, EEVEE_WINDOW_BY_LENGTH
 from . import add, add_input, math, out, principled, scaled, vector_math
 
 NAME = "RefGS World Diffuse"  # the group, and its node in a material
 BANDS = (0.28209479177387814, 0.4886025119029199)  # constants of the first two bands
 # Constants of the third band, for xy, yz, 3z² − 1, xz and x² − y².
 THIRD = (1.0925484305920792, 1.0925484305920792, 0.31539156525252005, 1.0925484305920792, 0.5462742152960396)
+UNIFORM = [(1.0,) * 3, *[(0.0,) * 3] * 8]  # harmonics of a white light from all sides
 MOST = 3.0  # largest factor; more would show where Eevee's irradiance is nearly zero
+LOBE = (1.0, 2 / 3, 1 / 4)  # harmonics of the cosine lobe, over π, by band
+ROTATION = "Panorama's Rotation"  # node that turns the normal into the panorama's frame
 _WINDOW = "Eevee's Second Band"
 
 
@@ -72,7 +76,7 @@ def world_diffuse_group() -> bpy.types.ShaderNodeTree:
     factor = scaled(tree, vector_math(tree, "SUBTRACT", ratio, (1.0,) * 3), amount)
     factor = vector_math(tree, "ADD", factor, (1.0,) * 3)
     add(tree, "NodeGroupOutput", {"Base Color": vector_math(tree, "MULTIPLY", group["Base Color"], factor)})
-    set_harmonics(tree, [(1.0,) * 3, *[(0.0,) * 3] * 8], 1.0)
+    set_harmonics(tree, UNIFORM)
     return tree
 
 
@@ -90,18 +94,61 @@ def _switch_off_elsewhere(value: bpy.types.NodeSocket) -> None:
     driver.expression = f"engine == {engines[EEVEE].value}"
 
 
-def set_harmonics(tree: bpy.types.ShaderNodeTree, harmonics: Sequence[Sequence[float]], window: float) -> None:
-    """Set the world's light in the node group `tree`.
+def set_harmonics(tree: bpy.types.ShaderNodeTree, harmonics: Sequence[Sequence[float]]) -> None:
+    """Set the world's light, before its rotation, in the node group `tree`.
 
     `harmonics` (9, 3) are spherical-harmonic coefficients of the irradiance over π, in Blender's working space, as Eevee's are. They belong
     to the polynomials 1; x, y, z; xy, yz, 3z² − 1, xz, x² − y². This function multiplies each coefficient by the constant that normalises
-    its harmonic. `window` is the factor by which Eevee weakens the coefficients of x, y and z.
+    its harmonic.
     """
     constants = (BANDS[0], *[BANDS[1]] * 3, *THIRD)
     for number, (rgb, constant) in enumerate(zip(harmonics, constants, strict=True)):
         for socket, value in zip(tree.nodes[_term(number)].inputs, rgb, strict=True):
             socket.default_value = value * constant
-    tree.nodes[_WINDOW].outputs[0].default_value = window
+    _set_window(tree)
+
+
+def set_rotation(tree: bpy.types.ShaderNodeTree, rotation: Sequence[float]) -> None:
+    """Set the rotation of the world's light (Euler angles) in the node group `tree`. Changes nothing if it is set already."""
+    socket = _rotation(tree).inputs["Rotation"]
+    if any(abs(old - new) > 1e-6 for old, new in zip(socket.default_value, rotation, strict=True)):
+        socket.default_value = rotation
+        _set_window(tree)
+
+
+def _rotation(tree: bpy.types.ShaderNodeTree) -> bpy.types.Node:
+    """Return the node ROTATION. It is inserted if it is missing: in a new group, and in those of files saved without it."""
+    if ROTATION not in tree.nodes:
+        normal = next(node for node in tree.nodes if node.type == "SEPXYZ").inputs[0]
+        # Of the same kind as the world's own node, so that it turns in the same way.
+        node = add(tree, "ShaderNodeMapping", {"Vector": normal.links[0].from_socket}, name=ROTATION)
+        node.vector_type = "TEXTURE"
+        tree.links.new(out(node), normal)
+    return tree.nodes[ROTATION]
+
+
+def _set_window(tree: bpy.types.ShaderNodeTree) -> None:
+    """Compute the factor by which Eevee weakens the world's harmonics of degree 1, from the light and rotation in the group `tree`.
+
+    For diffuse light, Eevee uses only the harmonics of degree 0 and 1. It multiplies the coefficients of degree 1 by the factor. The factor
+    is 1 if they are within a limit. Otherwise it is the largest one that brings red, green and blue within the limit. Let c be the
+    coefficient of degree 0 of the radiance in one of these colours, and v the vector of the three coefficients of degree 1.
+    - Until Blender 5.0, no component of v may exceed c / √3.
+    - From 5.1 on, the length of v may not exceed 0.75 · c.
+
+    On spheres in 4.3, 4.5, 5.0, 5.1, 5.2 and 5.3, under five panoramas each, the computed factor was right to 0.02.
+    """
+    turn = Euler(_rotation(tree).inputs["Rotation"].default_value).to_matrix()
+    terms = [[socket.default_value for socket in tree.nodes[_term(number)].inputs] for number in range(4)]
+    factor = 1.0
+    for constant, *line in zip(*terms, strict=True):
+        v = turn @ Vector(line) / (LOBE[1] * BANDS[1])
+        if EEVEE_WINDOW_BY_LENGTH:
+            allowed, needed = 0.75 * constant / BANDS[0], v.length
+        else:
+            allowed, needed = constant / BANDS[1], max(map(abs, v))
+        factor = min(factor, allowed / max(needed, 1e-12))
+    tree.nodes[_WINDOW].outputs[0].default_value = factor
 
 
 def add_world_diffuse(material: bpy.types.Material, occlusion: bpy.types.NodeSocket | None = None) -> None:

@@ -6,11 +6,11 @@ import bpy
 
 from ..errors import InputError
 from ..nodes.panorama_world import IMAGE, RECOVERED, get_light, is_panorama, panorama_world, set_light
-from ..nodes.world_diffuse import NAME, set_harmonics
+from ..nodes.world_diffuse import NAME, UNIFORM, set_harmonics, set_rotation
 from ..ordinary import check_file
 
 ENDINGS = (".exr", ".hdr")
-LIGHT = "refgs_light"  # custom property of the node group that corrects diffuse light: the light it is set to
+LIGHT = "refgs_light"  # custom property of the node group that corrects diffuse light: the name of the panorama that it is set to
 
 
 def hdris(folder: Path | None = None) -> list[Path]:
@@ -109,14 +109,14 @@ def correct_diffuse(scene: bpy.types.Scene) -> None:
     tree = bpy.data.node_groups.get(NAME)
     if tree is None:
         return
-    image, rotation, _ = get_light(scene.world) if is_panorama(scene.world) else (None, (), 0.0)
-    light = f"{image.name if image else ''} {[round(angle, 6) for angle in rotation]}"
-    if tree.get(LIGHT) == light:
-        return
-    tree[LIGHT] = light
-    if image is None or min(image.size) == 0:
-        set_harmonics(tree, [(1.0,) * 3, *[(0.0,) * 3] * 8], 1.0)
-        return
-    from .panorama import diffuse_light
+    image, rotation, _ = get_light(scene.world) if is_panorama(scene.world) else (None, (0.0,) * 3, 0.0)
+    light = image.name if image is not None and min(image.size) > 0 else ""
+    if tree.get(LIGHT) != light:
+        tree[LIGHT] = light
+        if light:
+            from .panorama import diffuse_light
 
-    set_harmonics(tree, *diffuse_light(image, rotation))
+            set_harmonics(tree, diffuse_light(image))
+        else:
+            set_harmonics(tree, UNIFORM)
+    set_rotation(tree, rotation)

@@ -1,6 +1,7 @@
 """Test the scene's light: list the panoramas, choose one, and rotate it to match the light that the training recovered."""
 
 import math
+import tracemalloc
 
 import bpy
 import numpy as np
@@ -196,11 +197,44 @@ def test_only_eevee_and_only_worlds_of_ours_are_corrected(run_folder, scene, tmp
         scene.render.engine = engine
         bpy.context.view_layer.update()
         assert switch.outputs[0].default_value == on
-
-    def harmonics():
-        return np.array([[x.default_value for x in tree.nodes[f"Harmonic {i}"].inputs] for i in range(9)])
-
-    assert harmonics()[1, 0] > harmonics()[1, 2] > 0.1
+    assert harmonics(tree)[1, 0] > harmonics(tree)[1, 2] > 0.1
     scene.world = bpy.data.worlds.new("the artist's own")
     correct_diffuse(scene)
-    assert not harmonics()[1:].any() and harmonics()[0].all()
+    assert not harmonics(tree)[1:].any() and harmonics(tree)[0].all()
+
+
+def harmonics(tree):
+    """Return the light that the node group `RefGS World Diffuse` is set to, (9, 3)."""
+    return np.array([[x.default_value for x in tree.nodes[f"Harmonic {i}"].inputs] for i in range(9)])
+
+
+def test_a_rotation_reads_no_pixels(addon, tmp_path):
+    """Check that the diffuse light follows an animated rotation by one node's value: its harmonics are those of the panorama."""
+    write_panorama(tmp_path / "sky.exr", half_sky(512))
+    tree = world_diffuse.world_diffuse_group()
+    relight(addon, tmp_path / "sky.exr")
+    before = harmonics(tree)
+    angle = addon.world.node_tree.nodes[ROTATION].inputs["Rotation"]
+    for frame in (1, 11):
+        angle.default_value = 0.0, 0.2, frame / 10
+        angle.keyframe_insert("default_value", frame=frame)
+    tracemalloc.start()
+    for frame in (1, 11):
+        addon.frame_set(frame)
+        turned = tree.nodes[world_diffuse.ROTATION].inputs["Rotation"].default_value
+        assert tuple(turned) == pytest.approx((0.0, 0.2, frame / 10))
+    assert tracemalloc.get_traced_memory()[1] < 1e5  # bytes; the panorama has 8 million
+    tracemalloc.stop()
+    np.testing.assert_array_equal(harmonics(tree), before)
+
+
+def test_the_group_of_an_earlier_file_learns_to_rotate(scene, tmp_path):
+    write_panorama(tmp_path / "sky.exr", half_sky())
+    tree = world_diffuse.world_diffuse_group()
+    links = len(tree.links)
+    node = tree.nodes[world_diffuse.ROTATION]
+    tree.links.new(node.inputs["Vector"].links[0].from_socket, node.outputs[0].links[0].to_socket)
+    tree.nodes.remove(node)
+    relight(scene, tmp_path / "sky.exr", rotation=1.0)
+    assert tree.nodes[world_diffuse.ROTATION].inputs["Rotation"].default_value[2] == 1.0
+    assert len(tree.links) == links
