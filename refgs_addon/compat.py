@@ -13,6 +13,10 @@ FORMAT = (["media_type"] if bpy.app.version >= (5, 0, 0) else []) + ["file_forma
 # Options of a property whose path may be relative to the .blend (`//`). Blender 4.5 warns without.
 BLEND_RELATIVE = {"ANIMATABLE", "PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else {"ANIMATABLE"}
 
+# Lines for the artist where an exporter of Blender's is missing.
+NO_USD = "this Blender was built without USD: use the one from blender.org, or export FBX"
+NO_FBX = "Blender's FBX add-on is off: enable it in the preferences"
+
 
 def set_format(settings: bpy.types.ImageFormatSettings, kind: str, depth: str) -> None:
     """Set the format of saved RGBA pictures: "PNG" or "OPEN_EXR", with `depth` bits per channel."""
@@ -100,6 +104,15 @@ def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
         return list(animation.action.fcurves)
     strips = [strip for layer in animation.action.layers for strip in layer.strips]
     return [curve for strip in strips for curve in strip.channelbag(animation.action_slot).fcurves]
+
+
+def has_operator(operator) -> bool:
+    """Check whether an operator of `bpy.ops` exists. Blender may be built without it, or its add-on may be off."""
+    try:
+        operator.get_rna_type()
+    except KeyError:
+        return False
+    return True
 
 
 def usd_materials() -> dict[str, str | bool]:

@@ -30,7 +30,9 @@ def contact_sheet(
     finished pictures and the name of the next light. The scene's light is restored. Raises InputError if there is no camera, if there is no
     light, if a light cannot be read, or if the file cannot be written.
     """
-    import numpy as np
+    import numpy as np  # Debian's Blender may lack it
+
+    from .pictures import read_png, write_png
 
     world = scene.world
     known = is_panorama(world) and world.get(RECOVERED) is not None
@@ -49,7 +51,7 @@ def contact_sheet(
                 relight(scene, light)
                 file = Path(folder) / f"{number}.png"
                 render_preview(scene, file, size=size, samples=samples)
-                pictures.append(_pixels(file))
+                pictures.append(read_png(file))
     finally:
         lit, scene.world = scene.world, world
         if before is not None:
@@ -68,34 +70,5 @@ def contact_sheet(
         row, column = divmod(number, columns)
         top, left = row * (height + GAP), column * (width + GAP)
         sheet[top : top + height, left : left + width] = picture
-    _write(sheet, png)
-
-
-def _pixels(file: Path):
-    """Read a PNG's RGBA values (h, w, 4) as they are stored, top row first."""
-    import numpy as np
-
-    image = bpy.data.images.load(str(file))
-    image.colorspace_settings.is_data = True
-    image.alpha_mode = "CHANNEL_PACKED"
-    pixels = np.empty(len(image.pixels), np.float32)
-    image.pixels.foreach_get(pixels)
-    pixels = pixels.reshape(image.size[1], image.size[0], 4)[::-1].copy()
-    bpy.data.images.remove(image)
-    return pixels
-
-
-def _write(pixels, png: Path) -> None:
-    import numpy as np
-
-    height, width = pixels.shape[:2]
-    image = bpy.data.images.new(png.stem, width, height, alpha=True)
-    image.alpha_mode = "CHANNEL_PACKED"
-    image.colorspace_settings.is_data = True
-    image.file_format = "PNG"
-    try:
-        image.pixels.foreach_set(np.ascontiguousarray(pixels[::-1]).ravel())
-        with atomic_write(png) as temporary:
-            image.save(filepath=str(temporary))
-    finally:
-        bpy.data.images.remove(image)
+    with atomic_write(png) as temporary:
+        write_png(temporary, sheet)

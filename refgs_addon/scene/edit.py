@@ -1,5 +1,8 @@
 """Edit the splats' materials. Each edit is a modifier, which the artist can change, switch off, move or remove at any time."""
 
+import contextlib
+from collections.abc import Iterator
+
 import bpy
 from mathutils import Vector
 
@@ -80,6 +83,21 @@ def splats_of(collection: bpy.types.Collection) -> bpy.types.Object:
     if not found or SPLATS not in found[0].modifiers:
         raise InputError(f"{collection.name} has no splats: import a RefGS run")
     return found[0]
+
+
+@contextlib.contextmanager
+def evaluated_splats(splats: bpy.types.Object) -> Iterator[bpy.types.PointCloud]:
+    """Yield the splats' points after all edits, without the deleted ones. They are gone after the `with` block."""
+    drawing = splats.modifiers[SPLATS]
+    before = drawing.show_viewport, splats.hide_viewport, splats.hide_get()
+    drawing.show_viewport = splats.hide_viewport = False  # Blender does not evaluate hidden objects
+    splats.hide_set(False)
+    try:
+        bpy.context.view_layer.update()
+        yield splats.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    finally:
+        drawing.show_viewport, splats.hide_viewport = before[:2]
+        splats.hide_set(before[2])
 
 
 def _region(splats: bpy.types.Object, collection: bpy.types.Collection, where: str) -> bpy.types.Object:

@@ -11,14 +11,14 @@ from numpy.lib.recfunctions import append_fields
 
 from ..errors import InputError
 from ..nodes.kept_tree import ROW
-from ..nodes.splats_tree import NAME as SPLATS
 from ..ply_file import PLY_TYPES, read_rows
 from .atomic_file import atomic_write
+from .bake_edits import bake_edits
 from .color_spaces import to_rec709
-from .edit import edits, is_edited, splats_of
+from .edit import edits, evaluated_splats, is_edited, splats_of
 from .mesh_exchange import TEXTURES, write_mesh
 from .run_parts import FOLDER, folder_of
-from .splat_cloud import MATERIALS, SH_DC, finite_rows, read_constants, srgb_to_linear
+from .splat_cloud import MATERIALS, SH_DC, finite_rows, linear_to_srgb, read_constants, srgb_to_linear
 
 KEPT = ("environment.exr", "cameras.json", "needs.json", "occluder.ply", "run.toml")
 DARK = 0.02  # a darker base colour does not reveal how much light falls on it
@@ -30,13 +30,7 @@ def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
     N is the number of splats that were not deleted. A fourth array, `row` (N,), has the index of each of these splats among all splats of
     the run.
     """
-    drawing = splats.modifiers[SPLATS]
-    before = drawing.show_viewport, splats.hide_viewport, splats.hide_get()
-    drawing.show_viewport = splats.hide_viewport = False  # Blender does not evaluate hidden objects
-    splats.hide_set(False)
-    try:
-        bpy.context.view_layer.update()
-        cloud = splats.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    with evaluated_splats(splats) as cloud:
         found = {}
         for name, field, width in (("base_color", "color", 4), ("metallic", "value", 1), ("roughness", "value", 1)):
             values = np.empty(width * len(cloud.points), np.float32)
@@ -48,9 +42,6 @@ def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
         found[ROW] = np.arange(len(cloud.points), dtype=np.int32)
         if ROW in cloud.attributes:
             cloud.attributes[ROW].data.foreach_get("value", found[ROW])
-    finally:
-        drawing.show_viewport, splats.hide_viewport = before[:2]
-        splats.hide_set(before[2])
     return found
 
 
@@ -102,11 +93,12 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
         file.write(rows)
 
 
-def export_run(collection: bpy.types.Collection, folder: Path) -> None:
+def export_run(collection: bpy.types.Collection, folder: Path, bake: bool = True) -> None:
     """Write a run with its edits as a new run folder. The run itself does not change.
 
-    If the run was edited, its mesh is not copied, because its shape and textures do not contain the edits. `refgs export` or the trainer
-    makes a new mesh. Raises InputError if the new folder exists already or cannot be written, or if the splats cannot be exported.
+    If the run was edited, its mesh gets the edits by `bake_edits`. Without `bake`, or if its mesh has no textures, the new run gets no
+    mesh: `refgs export` or the trainer makes one. Raises InputError if the new folder exists already or cannot be written, or if the splats
+    or the mesh cannot be exported.
     """
     original = run_folder(collection)
     if folder.exists():
@@ -115,12 +107,16 @@ def export_run(collection: bpy.types.Collection, folder: Path) -> None:
     try:
         temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         export_splats(collection, temporary / "splats.ply")
-        kept = [*KEPT] if is_edited(splats_of(collection)) else [*KEPT, "mesh.glb"]
-        for name in kept:
+        for name in KEPT:
             if (original / name).is_file():
                 shutil.copy2(original / name, temporary / name)
-        if "mesh.glb" in kept and (original / TEXTURES).is_dir():
-            shutil.copytree(original / TEXTURES, temporary / TEXTURES)
+        mesh, textures = original / "mesh.glb", original / TEXTURES
+        if mesh.is_file() and not is_edited(splats_of(collection)):
+            shutil.copy2(mesh, temporary / mesh.name)
+            if textures.is_dir():
+                shutil.copytree(textures, temporary / TEXTURES)
+        elif bake and mesh.is_file() and textures.is_dir():
+            bake_edits(collection, mesh, temporary)
         temporary.chmod(0o755)  # mkdtemp makes folders that only the owner can read
         os.replace(temporary, folder)
     except OSError as error:
@@ -139,20 +135,24 @@ def export_light(collection: bpy.types.Collection, path: Path) -> None:
 
 
 def export_mesh(collection: bpy.types.Collection, path: Path, engine: str = "Any Program") -> None:
-    """Write a run's mesh with its textures, as .glb, .usdc or .fbx. A .glb is a copy of the run's file.
+    """Write a run's mesh with its textures and edits, as .glb, .usdc or .fbx. Without edits, a .glb is a copy of the run's file.
 
-    `mesh_exchange.write_mesh` writes the other two, with the extra textures that the game engine `engine` needs. Raises InputError if the
-    run has no mesh, or if the run was edited: the mesh does not contain the edits.
+    `bake_edits` puts the edits into the textures. What the mesh has of deleted splats stays. `mesh_exchange.write_mesh` writes .usdc and
+    .fbx, with the extra textures that the game engine `engine` needs. Raises InputError if the run has no mesh, or a file cannot be read or
+    written.
     """
     mesh = run_folder(collection) / "mesh.glb"
-    if is_edited(splats_of(collection)):
-        raise InputError("the mesh lacks the edits: apply them to a new run, and export the mesh of that one")
     if not mesh.is_file():
         raise InputError(f"{mesh} does not exist: make the run's mesh first")
-    if path.suffix.lower() == ".glb":
-        _copy(mesh, path)
-    else:
-        write_mesh(mesh, path, engine)
+    if not path.parent.is_dir():
+        raise InputError(f"cannot write {path}: its folder does not exist")
+    with tempfile.TemporaryDirectory() as work:
+        if edits(splats_of(collection)):
+            mesh = bake_edits(collection, mesh, Path(work))
+        if path.suffix.lower() == ".glb":
+            _copy(mesh, path)
+        else:
+            write_mesh(mesh, path, engine)
 
 
 def _copy(file: Path, path: Path) -> None:
@@ -167,9 +167,3 @@ def run_folder(collection: bpy.types.Collection) -> Path:
         lost = bpy.path.abspath(collection.get(FOLDER, ""))
         raise InputError(f"the run of {collection.name} is no longer at {lost}: press Find Run Folder in the panel Run")
     return folder
-
-
-def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Encode linear values as sRGB, clipped to 0..1."""
-    x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import bpy
 
-from ..compat import node_tree, usd_materials
+from ..compat import NO_FBX, NO_USD, node_tree, usd_materials
 from ..errors import InputError
 from ..nodes import add, out, principled
 from ..nodes.splat_material import SPECULAR
@@ -36,10 +36,7 @@ def write_mesh(mesh: Path, path: Path, engine: str = "Any Program") -> None:
     `engine` is the game engine for which extra textures are written to the same folder: "Unreal", "Unity", or "Any Program" for none. The
     open .blend does not change. Raises InputError if a texture is missing, or if a file cannot be read or written.
     """
-    sources = {name: mesh.parent / TEXTURES / f"{name}.png" for name in (*_PICTURES, "occlusion")}
-    for source in sources.values():
-        if not source.is_file():
-            raise InputError(f"{source} does not exist: make the run's mesh again")
+    sources = textures_of(mesh)
     before = data_blocks()
     try:
         # All is made in a folder of its own: with MaterialX, Blender leaves a second copy of the textures beside the file.
@@ -70,6 +67,15 @@ def write_mesh(mesh: Path, path: Path, engine: str = "Any Program") -> None:
         bpy.data.batch_remove(data_blocks() - before)
 
 
+def textures_of(mesh: Path) -> dict[str, Path]:
+    """Return the PNG textures beside a run's mesh.glb by name. Raises InputError if one is missing."""
+    files = {name: mesh.parent / TEXTURES / f"{name}.png" for name in (*_PICTURES, "occlusion")}
+    for file in files.values():
+        if not file.is_file():
+            raise InputError(f"{file} does not exist: make the run's mesh again")
+    return files
+
+
 def _specular(item: bpy.types.Object) -> float:
     """Return the Specular IOR Level of an imported mesh's material."""
     return principled(item.data.materials[0]).inputs[SPECULAR].default_value
@@ -95,26 +101,20 @@ def _pack(path: Path, folder: Path, channels: tuple[tuple[str, int], ...]) -> No
     """Write a PNG from (texture, channel index) pairs, inverted if the name begins with "-"."""
     import numpy as np  # Debian's Blender may lack it
 
+    from .pictures import read_png, write_png
+
     found = []
     for name, channel in channels:
-        image = bpy.data.images.load(str(folder / f"{name.removeprefix('-')}.png"))
-        image.colorspace_settings.is_data = True
-        values = np.empty(4 * image.size[0] * image.size[1], np.float32)
-        image.pixels.foreach_get(values)
-        found.append(1 - values[channel::4] if name.startswith("-") else values[channel::4])
-    packed = bpy.data.images.new(path.stem, *image.size, alpha=len(found) == 4, is_data=True)
-    packed.alpha_mode = "CHANNEL_PACKED"
-    packed.pixels.foreach_set(np.stack([*found, np.ones_like(found[0])][:4], axis=1).ravel())
-    packed.file_format = "PNG"
-    packed.filepath_raw = str(path)
-    packed.save()
+        values = read_png(folder / f"{name.removeprefix('-')}.png")[..., channel]
+        found.append(1 - values if name.startswith("-") else values)
+    write_png(path, np.stack(found, axis=2))
 
 
 def _usd(file: str) -> None:
     try:
         materials = usd_materials()
     except KeyError:
-        raise InputError("this Blender was built without USD: use the one from blender.org, or export FBX") from None
+        raise InputError(NO_USD) from None
     bpy.ops.wm.usd_export(filepath=file, export_custom_properties=False, convert_world_material=False, **materials)
 
 
@@ -122,7 +122,7 @@ def _fbx(file: str) -> None:
     try:
         bpy.ops.export_scene.fbx(filepath=file, path_mode="RELATIVE", use_tspace=True, bake_anim=False)
     except AttributeError:  # the operator does not exist
-        raise InputError("Blender's FBX add-on is off: enable it in the preferences") from None
+        raise InputError(NO_FBX) from None
 
 
 _EXPORTERS = {".usdc": _usd, ".fbx": _fbx}

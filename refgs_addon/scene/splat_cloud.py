@@ -167,6 +167,12 @@ def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
+def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
+    """Encode linear values as sRGB, clipped to 0..1."""
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+
+
 def _flatten_gaussians(rotation: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Flatten 3D Gaussians to discs, with quaternions wxyz (N, 4) and scales (N, 2)."""
     shortest = np.where(scale[:, 2] <= scale.min(axis=1), 2, scale.argmin(axis=1))

@@ -234,12 +234,12 @@ def _train(scene: bpy.types.Scene, out: Path, changes: dict[str, object]) -> job
 def apply_edits(scene: bpy.types.Scene, collection: bpy.types.Collection, out: Path) -> jobs.Job | None:
     """Write a run with its edits as a new run folder, and add the folder to the scene's list.
 
-    If the new folder has no mesh and a trainer is set up, a job makes the mesh and textures. Returns that job, or None. Raises InputError
-    where the run cannot be exported.
+    If a trainer is set up, a job makes the mesh and textures, unless the new folder has those of the unedited run. Without a trainer, the
+    edits are baked into the run's mesh here. Returns the job, or None. Raises InputError where the run cannot be exported.
     """
     from .export_run import export_run
 
-    export_run(collection, out)
+    export_run(collection, out, bake=not set_up())
     _remember(scene, out)
     if (out / "mesh.glb").exists() or not set_up():
         return None
@@ -262,7 +262,7 @@ def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.
         raise InputError(f"cannot write {file}: its folder does not exist")
     if is_edited(splats_of(collection)):
         edited = Path(tempfile.mkdtemp(dir=bpy.app.tempdir), folder.name)  # Blender deletes tempdir when it ends
-        export_run(collection, edited)
+        export_run(collection, edited, bake=False)
         folder = edited
     job = jobs.display_splats(trainer, folder, file, log_file(f"export {file.stem}"))
     follow_jobs()

@@ -7,17 +7,40 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
+from ..compat import NO_FBX, NO_USD, has_operator
 from ..scene import training
-from ..scene.run_parts import FOLDER, active_run
+from ..scene.deleted_splats import count_deleted
+from ..scene.edit import edits, splats_of
+from ..scene.run_parts import FOLDER, active_run, folder_of, parts
 from .operators import ImportRun, OnRun, has_trainer
 
 
 class _Export(OnRun, ExportHelper):
-    """Export a part (`kind`, such as "mesh") of the active run to a chosen file."""
+    """Export a part (`kind`, such as "mesh") of the active run to a chosen file.
+
+    The button is disabled while there is a `problem`, and its tooltip says which.
+    """
 
     bl_options: ClassVar = {"REGISTER"}
 
     filter_glob: StringProperty(options={"HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not super().poll(context):
+            return False
+        folder = folder_of(active_run(context))
+        if folder is None:
+            problem = "The run's folder was moved or deleted: press Find Run Folder in the panel Run"
+        else:
+            problem = cls.problem(active_run(context), folder)
+        cls.poll_message_set(problem[:1].upper() + problem[1:])
+        return not problem
+
+    @classmethod
+    def problem(cls, run: bpy.types.Collection, folder: Path) -> str:
+        """Say what is missing for the export of a run in its folder, or return ""."""
+        return ""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         folder = Path(active_run(context).get(FOLDER, ""))
@@ -68,15 +91,39 @@ class ExportDisplaySplats(_Export, bpy.types.Operator):
         self.report({"INFO"}, f"Making {file.name}: the Train panel shows the progress")
 
 
-class ExportMesh(_Export, bpy.types.Operator):
+class _ExportMesh(_Export):
+    kind = "mesh"
+
+    @classmethod
+    def problem(cls, run: bpy.types.Collection, folder: Path) -> str:
+        if not (folder / "mesh.glb").is_file():
+            return "This run has no mesh. The trainer makes one: set it up, and press Apply to New Run"
+        edited = any(edits(splats) for splats in parts(run).get("splats", []))
+        if (edited or cls.filename_ext != ".glb") and not (folder / "textures").is_dir():
+            return "The folder textures is missing beside the run's mesh.glb: copy it there"
+        return ""
+
+    def work(self, context: bpy.types.Context) -> None:
+        super().work(context)
+        warn_of_deleted(self, active_run(context))
+
+
+def warn_of_deleted(operator: bpy.types.Operator, collection: bpy.types.Collection) -> None:
+    """Tell the artist that a mesh was written that still contains deleted splats, if any were deleted."""
+    if count_deleted(splats_of(collection)):
+        text = "The mesh keeps what was fused into it of deleted splats. With the trainer, Apply to New Run makes one without"
+        operator.report({"WARNING"}, text)
+
+
+class ExportMesh(_ExportMesh, bpy.types.Operator):
     bl_idname = "refgs.export_mesh"
     bl_label = "RefGS Mesh with Textures (.glb)"
-    bl_description = "Export the mesh with its base colour, metallic, roughness and normal textures"
+    bl_description = "Export the mesh with its edited base colour, metallic and roughness, and its normal texture"
 
-    kind, filename_ext = "mesh", ".glb"
+    filename_ext = ".glb"
 
 
-class _ExportMeshFor(_Export):
+class _ExportMeshFor(_ExportMesh):
     engine: EnumProperty(
         name="Textures for",
         description="Write textures as a game engine packs them beside the separate ones",
@@ -94,17 +141,29 @@ class _ExportMeshFor(_Export):
 class ExportMeshUsd(_ExportMeshFor, bpy.types.Operator):
     bl_idname = "refgs.export_mesh_usd"
     bl_label = "RefGS Mesh with Textures (.usdc)"
-    bl_description = "Export the mesh as USD, with its textures in a folder beside it, whatever is hidden or selected"
+    bl_description = (
+        "Export the mesh as USD, with its edited textures in a folder beside it, whatever is hidden or selected"
+    )
 
-    kind, filename_ext = "mesh", ".usdc"
+    filename_ext = ".usdc"
+
+    @classmethod
+    def problem(cls, run: bpy.types.Collection, folder: Path) -> str:
+        return NO_USD if not has_operator(bpy.ops.wm.usd_export) else super().problem(run, folder)
 
 
 class ExportMeshFbx(_ExportMeshFor, bpy.types.Operator):
     bl_idname = "refgs.export_mesh_fbx"
     bl_label = "RefGS Mesh with Textures (.fbx)"
-    bl_description = "Export the mesh as FBX, with its textures in a folder beside it, whatever is hidden or selected"
+    bl_description = (
+        "Export the mesh as FBX, with its edited textures in a folder beside it, whatever is hidden or selected"
+    )
 
-    kind, filename_ext = "mesh", ".fbx"
+    filename_ext = ".fbx"
+
+    @classmethod
+    def problem(cls, run: bpy.types.Collection, folder: Path) -> str:
+        return NO_FBX if not has_operator(bpy.ops.export_scene.fbx) else super().problem(run, folder)
 
 
 class ExportLight(_Export, bpy.types.Operator):
@@ -114,13 +173,17 @@ class ExportLight(_Export, bpy.types.Operator):
 
     kind, filename_ext = "light", ".exr"
 
+    @classmethod
+    def problem(cls, run: bpy.types.Collection, folder: Path) -> str:
+        return "" if (folder / "environment.exr").is_file() else "This run has no recovered light"
+
 
 class ApplyEdits(_Export, bpy.types.Operator):
     bl_idname = "refgs.apply_edits"
     bl_label = "Apply to New Run"
     bl_description = (
-        "Write the run with its edits as a new run folder. The trainer, if set up, makes its mesh and textures. "
-        "The imported run does not change"
+        "Write the run with its edits as a new run folder. The trainer, if set up, makes its mesh and textures; "
+        "otherwise the edits are baked into the textures. The imported run does not change"
     )
 
     kind, filename_ext = "edited", ""
@@ -128,9 +191,11 @@ class ApplyEdits(_Export, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         out = Path(bpy.path.abspath(self.filepath))
-        job = training.apply_edits(context.scene, active_run(context), out)
-        mesh = "" if (out / "mesh.glb").exists() else "; set up the trainer in the preferences to make its mesh"
+        job, made = training.apply_edits(context.scene, active_run(context), out), (out / "mesh.glb").exists()
+        mesh = "" if made else "; set up the trainer in the preferences to make its mesh"
         self.report({"INFO"}, f"Wrote {out}" + ("; its mesh is being made" if job else mesh))
+        if made:
+            warn_of_deleted(self, active_run(context))
 
 
 FILES = (ExportSplats, ExportDisplaySplats, ExportMesh, ExportMeshUsd, ExportMeshFbx, ExportLight)

@@ -119,7 +119,7 @@ def test_what_is_in_the_way_is_said_in_one_line(textured, scene, tmp_path, endin
     refused("a", "make the run's mesh first")
     assert data_blocks() == before
     add_edit(run.collection)
-    refused("a", "lacks the edits")
+    refused("a", "make the run's mesh first")
     assert not (tmp_path / f"a{ending}").exists()
 
 

@@ -84,8 +84,9 @@ def test_without_edits_the_mesh_comes_along(run, tmp_path, scene):
     export_mesh(run.collection, tmp_path / "a.glb")
     export_light(run.collection, tmp_path / "a.exr")
     add_edit(run.collection)
-    with pytest.raises(InputError, match="lacks the edits"):
+    with pytest.raises(InputError, match=r"base_color\.png does not exist: make the run's mesh again"):
         export_mesh(run.collection, tmp_path / "b.glb")
+    assert not (tmp_path / "b.glb").exists()
 
 
 def test_what_is_not_there_is_said_in_one_line(run, run_folder, tmp_path):
