@@ -115,7 +115,7 @@ def test_exposures_are_learned_where_photos_differ(tmp_path):
     truth = np.array([STOPS[i % len(STOPS)] for i in index])
     assert with_them.state.learned["exposure"].shape[1] == 1 and "not in white" in with_them.state.decided["exposures"]
     found = with_them.state.learned["exposure"].detach().numpy()[:, 0] / np.log(2)
-    assert np.abs(found - truth).max() < 0.2
+    assert np.abs(found - truth).max() < 0.25
     frames = json.loads((tmp_path / "auto" / "cameras.json").read_text())["frames"]
     factors = [frame.get("exposure") for frame in frames if frame["split"] == "train"]
     np.testing.assert_allclose(factors, 2**found, rtol=1e-5)

@@ -109,6 +109,22 @@ def test_a_metal_in_the_dark_is_told_by_what_it_mirrors_of_the_object(diffuse, r
         assert torch.allclose(fits.of_object.reflectance, torch.tensor(reflectance), atol=0.03)
 
 
+def test_wrong_normals_do_not_change_how_much_metals_reflect_on_the_whole():
+    """Check a metal of 0.8 whose rays meet other points of the object than those it mirrors: least squares take it for darker."""
+    count, photos = 400, 12
+    generator = torch.Generator().manual_seed(0)
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(count, photos, 3)
+    there = torch.rand(photos, count, 3, generator=generator)
+    shown = 0.8 * there.transpose(0, 1)
+    seen = Seen(shown, torch.full((count, photos), 4.0), torch.full((count,), 48.0), shown.mean(dim=1), up, up)
+    near = neighbours(torch.rand(count, 3, generator=generator), NEIGHBOURS)
+    met = torch.ones(photos, count, dtype=torch.bool)
+    other = there[:, torch.randperm(count, generator=generator)]
+    fit = mirrored.fit_both(seen, (([each] * 3, which) for each, which in zip(other, met, strict=True)), near).of_object
+    assert torch.allclose(fit.level.mean(dim=0), torch.tensor(0.8), atol=0.02) and float(fit.level.std()) < 0.05
+    assert float(fit.reflectance.mean()) < 0.7
+
+
 def test_metals_are_as_the_metals_around_them():
     points, normals, ball = ball_on_board()
     was = torch.where(ball & (points[:, 2] > 1), raw_metallic(0.98), raw_metallic(0.02))

@@ -24,11 +24,12 @@ from refgs.train.learn.light import MirroredLight
 from refgs.train.learn.poses import Poses
 from refgs.train.learn.priors import Priors
 from refgs.train.learn.trace import TracedMesh
+from refgs.train.material import base_colors
 from refgs.train.material.metals import Metals
 from refgs.train.part import Part
 from refgs.train.photo import Photo
 from refgs.train.plan import Plan
-from refgs.train.start import start_appearance, start_parameters
+from refgs.train.start import Start, start_appearance, start_parameters
 from refgs.train.state import State, why_not_traced
 from refgs.train.timeline import Step
 
@@ -44,13 +45,16 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     needs.evaluate(state, "photos")
     state.photos = [Photo.of(view, state.device) for view in state.views]
     with state.clock.part("start"):
-        start, on_hull, source = start_parameters(capture, state.views, state.settings)
-    _choose_light_frame(state, start, on_hull)
+        start = start_parameters(capture, state.views, state.settings)
+    _choose_light_frame(state, start)
     if state.from_hull and state.method.lit and state.settings.light.frame == "world":
         with state.clock.part("start"):
-            start, on_hull, source = start_parameters(capture, state.views, state.settings, hollows=True)
-    report("stage", {"what": source, "detail": True})
-    _start_learning(state, start)
+            start = start_parameters(capture, state.views, state.settings, hollows=True)
+    report("stage", {"what": start.said, "detail": True})
+    _start_learning(state, start.parameters)
+    if not state.initial:
+        with state.clock.part("start"):
+            base_colors.start(state, start.points.positions, start.points.normals)
     state.parts = {kind: kind() for kind in PARTS}
     for part in state.parts.values():
         part.start(state)
@@ -62,7 +66,7 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     return state
 
 
-def _choose_light_frame(state: State, start: Parameters, on_hull: int) -> None:
+def _choose_light_frame(state: State, start: Start) -> None:
     """If `light.frame` is "auto", decide whether the light turns with the camera."""
     lit = state.method.lit
     if state.settings.light.frame != "auto":
@@ -70,8 +74,8 @@ def _choose_light_frame(state: State, start: Parameters, on_hull: int) -> None:
     frame, why = "world", "there is no light" if not lit else "not every photo has a mask of the object"
     if lit and state.from_hull:
         with torch.no_grad():
-            points = activate(start)
-            found = points.positions[:on_hull].numpy(), points.normals()[:on_hull].numpy()
+            points = activate(start.parameters)
+            found = points.positions[: start.on_hull].numpy(), points.normals()[: start.on_hull].numpy()
         frame, why = light_frame(state.views, *found, state.capture.radius)
     state.change("light.frame", frame, "photos", why)
     if lit:

@@ -1,6 +1,7 @@
 """Make the initial parameters of the surfels: geometry, colour and material."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,20 +15,26 @@ GEOMETRY = ("position", "rotation", "scale", "opacity")
 FAINT = 0.1  # largest opacity of points that may not lie on the surface
 
 
-def start_parameters(
-    capture: Capture, views: list[LoadedView], settings: Settings, hollows: bool = False
-) -> tuple[Parameters, int, str]:
-    """Make the initial parameters of the surfels. `first_points` chooses their positions; `hollows` is passed on to it.
+class Start(NamedTuple):
+    """Hold the initial `parameters` of the surfels, and the `points` at which they start.
 
-    Returns the parameters, the number of surfels on the visual hull, and a message for the user that says where the surfels start. Surfels
-    on the hull come first. Without a hull, the number is that of all surfels.
+    The first `on_hull` surfels lie on the visual hull; without a hull, all are counted. `said` tells the user where the surfels start.
     """
+
+    parameters: Parameters
+    on_hull: int
+    said: str
+    points: FirstPoints
+
+
+def start_parameters(capture: Capture, views: list[LoadedView], settings: Settings, hollows: bool = False) -> Start:
+    """Make the initial parameters of the surfels. `first_points` chooses their positions; `hollows` is passed on to it."""
     points = first_points(capture, views, settings.surfels, settings.train.seed, hollows)
     shown = len(points.positions) if points.on_hull is None else points.on_hull
     opacity = settings.surfels.opacity
     parameters = _initial(points, settings.surfels, min(opacity, FAINT) if points.on_hull is None else opacity)
     parameters["opacity"].data[shown:].clamp_(max=math.log(FAINT / (1 - FAINT)))
-    return parameters, shown, f"{len(points.positions)} surfels start on {points.source}"
+    return Start(parameters, shown, f"{len(points.positions)} surfels start on {points.source}", points)
 
 
 def start_appearance(settings: Settings) -> Parameters:

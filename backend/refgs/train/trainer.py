@@ -50,7 +50,8 @@ ACTIONS: dict[str, Callable[[State, Step], object]] = {
     "find metals": metals.find_metals,
     "judge metals": metals.judge,
     "even coloured metal out": even_metal.even_out,
-    "keep base colours' brightness": metals.keep_brightness,
+    "keep base colours": metals.keep_base_colors,
+    "average paint's base colours": metals.average_paint,
     "prune and divide surfels": densify.prune_and_divide,
     "propagate normals": densify.propagate_normals,
     "reset opacities": densify.reset_opacity,
@@ -106,7 +107,7 @@ class Trainer:
         state = self.state
         inputs, step.photo = state.inputs(), coarse.photo(state, step.view, WHOLE.due(state, step))
         step.rendering = state.picture(inputs, step.photo.camera, exposures.exposure(state, step.view))
-        mean = light.mean_radiance(state, inputs.environment)
+        mean = None if state.part(metals.Metals).colored else light.mean_radiance(state, inputs.environment)
         loss, square = objective(step.rendering, mean, step.photo, state.background, state.losses, step.progress)
         if "exposure" in state.learned:
             loss = loss + state.settings.loss.exposure * departure(state.learned["exposure"][step.view])

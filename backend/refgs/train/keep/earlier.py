@@ -23,8 +23,8 @@ def as_of_today(
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Convert the tensors and facts of a checkpoint of release 0.1.0 to the present form. Return those of later releases unchanged.
 
-    0.1.0 had no masks `held` and `told`: surfels with a metallic value in HELD did not learn it. All parts (see `Part`) shared one table
-    of facts. Linear light was the softplus of raw texels, and is their exponential now. `light` is how the run represents light.
+    0.1.0 had no `held`, `told` and `shown_color`: surfels with a metallic value in HELD did not learn it. All parts (see `Part`) shared one
+    table of facts. Linear light was the softplus of raw texels, and is their exponential now. `light` is how the run represents light.
     """
     if "residual" in facts:
         return tensors, facts
@@ -35,13 +35,15 @@ def as_of_today(
     if (metallic := tensors.get("parameter.metallic")) is not None:
         tensors["parameter.held"] = torch.isin(metallic, torch.tensor([raw_metallic(value) for value in HELD]))
         tensors["parameter.told"] = torch.zeros_like(tensors["parameter.held"])
+        tensors["parameter.shown_color"] = torch.zeros(len(metallic), 4)
     elif "constant.metallic" in tensors:
         tensors["constant.held"] = tensors["constant.told"] = torch.zeros(1, dtype=torch.bool)
+        tensors["constant.shown_color"] = torch.zeros(1, 4)
     harmonics = tensors.get("parameter.sh_rest")
     known = {"spent": facts.get("seconds", 0.0), "processor_seconds": 0.0, "decided": {}, "needs": {}} | facts
     known |= {"residual": harmonics is not None and bool(harmonics.any()), "clock": facts.get("parts", {})}
     known["parts"] = {
-        "metals": {"found": facts.get("metals_set", True)},
+        "metals": {"found": facts.get("metals_set", True), "colored": False},
         "poses": {"judged": facts.get("poses_judged", True)},
         "coarse": {"factor": facts.get("reduced", 1)},
     }

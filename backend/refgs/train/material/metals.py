@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 
 from refgs.model.surfels import raw_metallic
-from refgs.train.material import brightness, questions
+from refgs.train.material import base_colors, questions
 from refgs.train.material.observe import Kinds
 from refgs.train.material.reckoning import like_metals, reckon
 from refgs.train.part import Part
@@ -27,18 +27,19 @@ TOLD = 0.005  # a change of a larger fraction of the surface is announced
 
 
 class Metals(Part):
-    """Remember in `found` whether metals have already been found.
+    """Remember whether metals have already been `found`, and whether they are `colored`: photos tell base colours of some that are sure.
 
-    `brightness` is the mean brightness that photos tell of those that are sure (see `brightness.told`), or None.
+    Of each surfel, remember whether hints hold its kind (`held`), whether photos are sure of it (`told`), and the base colour that photos
+    tell of it, if it is metal (`shown_color`, see `base_colors.told`).
     """
 
-    name, saved = "metals", ("found", "brightness")
-    found = False
-    brightness: torch.Tensor | None = None
+    name, saved = "metals", ("found", "colored")
+    found = colored = False
 
     def start(self, state: State) -> None:
-        self.found, self.brightness = False, None
+        self.found = self.colored = False
         if "metallic" in state.learned:
+            state.learned.learn("shown_color", torch.zeros(state.learned.count, 4, device=state.device))
             for name in ("held", "told"):
                 none = torch.zeros(state.learned.count, dtype=torch.bool, device=state.device)
                 state.learned.learn(name, none)
@@ -65,7 +66,8 @@ def _judge(state: State, first: bool = False) -> None:
     """Set metallic to the kind that photos tell. It does not learn where they are sure, or where a hint holds it.
 
     A surfel that was taken for paint, but is metal, takes the base colour and roughness of the metals around it. An example is the lower
-    half of a ball on a table: it mirrors only the table, so it has learned the table's colour as its own.
+    half of a ball on a table: it mirrors only the table, so it has learned the table's colour as its own. The first time, all metals take
+    the base colour that photos tell.
     """
     found = reckon(state)
     names = "metallic", "albedo", "roughness"
@@ -77,19 +79,24 @@ def _judge(state: State, first: bool = False) -> None:
     metallic[raised], metallic[lowered] = raw_metallic(GIVEN.metal), raw_metallic(GIVEN.paint)
     metallic[metal], metallic[paint] = raw_metallic(HELD.metal), raw_metallic(HELD.paint)
     state.learned["told"].copy_(metal | paint)
+    shown = state.learned["shown_color"]
+    shown.copy_(base_colors.told(found, _sure_kinds(state)[0].cpu()))
+    state.part(Metals).colored = bool(shown.any())
     if raised.any():
-        material = torch.logit(brightness.plausible(like_metals(found))).to(metallic.device)
+        material = torch.logit(base_colors.plausible(like_metals(found))).to(metallic.device)
         albedo[raised], roughness[raised] = material[raised, :3], material[raised, 3]
     if first:
         # The first light is blurred. A metal that became rough under it would stay so, while one that is too sharp learns.
         fresh = likely > LIKELY
         roughness[fresh] = roughness[fresh].clamp_max(math.log(SHARP / (1 - SHARP)))
         state.learned.forget("roughness", fresh)
+        fresh = _sure_kinds(state)[0] & (shown[:, 3] > 0)
+        albedo[fresh] = torch.logit(base_colors.plausible(shown[fresh, :3]))
+        state.learned.forget("albedo", fresh)
     for name in names:
         state.learned.forget(name, raised | lowered)
     state.learned.forget("metallic", metal | paint)
     now = state.surfels()
-    state.part(Metals).brightness = brightness.told(now.albedo.cpu(), found, _sure_kinds(state)[0].cpu())
     whole = max(float(found.pixels.sum()), 1e-6)
     kinds = now.metallic > 0.5, raised, lowered
     metals, more, less = (float(found.pixels[which.cpu()].sum()) / whole for which in kinds)
@@ -145,11 +152,21 @@ def hold_as(state: State, kinds: torch.Tensor) -> None:
     state.part(Metals).found = True
 
 
-def keep_brightness(state: State, step: Step) -> None:
-    """Keep base colours as bright as what metals mirror of the object tells (see `brightness`)."""
-    mean = state.part(Metals).brightness
-    if mean is not None and {"albedo", "metallic"} <= state.learned.keys():
-        brightness.keep(state, *_sure_kinds(state), mean.to(state.device))
+def keep_base_colors(state: State, step: Step) -> None:
+    """Keep base colours at what photos and experience tell, see `base_colors`."""
+    if _base_colors_kept(state):
+        base_colors.keep(state, *_sure_kinds(state))
+
+
+def average_paint(state: State, step: Step) -> None:
+    """Average base colours of paint over neighbours, so that the light learns shades, and not the paint."""
+    if _base_colors_kept(state):
+        base_colors.average(state, _sure_kinds(state)[1])
+
+
+def _base_colors_kept(state: State) -> bool:
+    """Tell whether photos tell base colours of metals on an object that masks show, so that they tell the light."""
+    return state.part(Metals).colored and state.from_hull and {"albedo", "metallic"} <= state.learned.keys()
 
 
 def _sure_kinds(state: State) -> tuple[torch.Tensor, torch.Tensor]:

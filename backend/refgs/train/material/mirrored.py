@@ -39,6 +39,8 @@ class Fit(NamedTuple):
     - `reflectance` (N, 3), `roughness` (N,): values of the metal that fits best; its reflectance is a mean over the neighbours
     - `mirrored` (N,): the mean radiance that they mirror
     - `pixels` (N,): their pixels in these photos
+    - `level` (N, 3): what they show in all of these photos together, divided by what a metal of reflectance 1 would show. Where normals
+      err, `reflectance` is too low: surfels mirror other points than their rays meet. Together they mirror the same.
     """
 
     ratio: Tensor
@@ -46,6 +48,7 @@ class Fit(NamedTuple):
     roughness: Tensor
     mirrored: Tensor
     pixels: Tensor
+    level: Tensor
 
 
 class Mirrored(NamedTuple):
@@ -119,7 +122,7 @@ class _Sums:
 
     def __init__(self, count: int, roughnesses: tuple[float, ...]) -> None:
         self._roughnesses = roughnesses
-        names, shape = ("rest", "both", "power", "paint", "first"), (len(roughnesses), count, 3)
+        names, shape = ("shown", "light", "rest", "both", "power", "paint", "first"), (len(roughnesses), count, 3)
         self._sums = {name: torch.zeros(shape, dtype=torch.double) for name in names}
         # Sums of weights, the mirrored, the shown, and its square.
         self._whole = torch.zeros(count, 8, dtype=torch.double)
@@ -130,6 +133,8 @@ class _Sums:
         for index, (roughness, light) in enumerate(zip(self._roughnesses, mirrored, strict=False)):
             first, second, _, coat = look_up(cosine, torch.full_like(cosine, roughness)).unsqueeze(2).unbind(dim=1)
             rest, reflected, dull = shown - second * light, first * light, shown - coat * light
+            self._sums["shown"][index] += weight * rest
+            self._sums["light"][index] += weight * reflected
             self._sums["rest"][index] += weight * rest.square()
             self._sums["both"][index] += weight * rest * reflected
             self._sums["power"][index] += weight * reflected.square()
@@ -158,10 +163,17 @@ class _Sums:
         best = metal.argmin(dim=1)
         rows = best, torch.arange(len(best))
         weight = sums["power"][rows] if by_power else total.expand(-1, 3)
-        summed = pooled(torch.cat([reflectance[rows] * weight, weight, light, total], dim=1).float(), near)
-        chosen, weight, light, pixels = summed.split([3, 3, 1, 1], dim=1)
-        chosen, light = chosen / weight.clamp_min(1e-12), light / pixels.clamp_min(1e-6)
-        values = ratio.clamp_min(1e-12).log(), chosen, torch.tensor(self._roughnesses)[best], light[:, 0], pixels[:, 0]
+        sums = reflectance[rows] * weight, weight, sums["shown"][rows], sums["light"][rows], light, total
+        chosen, weight, shown, full, light, pixels = pooled(torch.cat(sums, dim=1).float(), near).split(
+            [3, 3, 3, 3, 1, 1], dim=1
+        )
+        chosen, light, level = (
+            chosen / weight.clamp_min(1e-12),
+            light / pixels.clamp_min(1e-6),
+            shown / full.clamp_min(1e-6),
+        )
+        rough = torch.tensor(self._roughnesses)[best]
+        values = ratio.clamp_min(1e-12).log(), chosen, rough, light[:, 0], pixels[:, 0], level.clamp(0, 1)
         return Fit(*(each.float() for each in values))
 
 

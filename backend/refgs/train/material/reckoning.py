@@ -95,7 +95,7 @@ def reckon(state: State) -> Reckoned:
     known = (seen.pixels > same_material.FRINGE) & (every.pixels > ENOUGH_PIXELS)
     metal = same_material.spread(graph, log_odds(values), known.float()).sigmoid()
     by_object = (of_object.pixels > ENOUGH_PIXELS) & (of_object.mirrored > LEAST_SHOWN)
-    reflectance = torch.where(by_object[:, None], of_object.reflectance, every.reflectance)
+    reflectance = torch.where(by_object[:, None], of_object.level, every.reflectance)
     roughness = torch.where(by_object, of_object.roughness, every.roughness)
     pixels = seen.pixels * state.wanted().cpu()
     return Reckoned(metal, surfels, seen, pixels, reflectance, roughness, by_object, graph, values, known)

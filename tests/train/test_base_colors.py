@@ -1,0 +1,127 @@
+"""Test that base colours start at what photos show, and are kept at what photos and experience tell."""
+
+import torch
+
+from refgs.model import cubemap
+from refgs.model.surfels import raw_metallic
+from refgs.train.keep import snapshot
+from refgs.train.material import base_colors, metals
+from tests.makers.pieces import ball_on_board, reckoned
+from tests.makers.training import do, put
+from tests.makers.training import trainer as small
+
+ROW = "keep base colours"
+
+
+def ball(by_object):
+    """Return what was reckoned of a metal ball on paint, whose surfels `by_object` (N,) reflect 0.8 of the object; and the metals (N,)."""
+    points, normals, metal = ball_on_board()
+    found = reckoned(points, normals, metal.float(), metal.float(), True)
+    which = metal & by_object(torch.arange(len(metal)))
+    return found._replace(by_object=which, reflectance=torch.where(which[:, None], 0.8, 0.1).expand(-1, 3)), metal
+
+
+def metal_and_paint(folder, capture, albedo, every=3):
+    """Make a small training on surfels of `albedo` (N, 3) or (3,), of which photos are sure: one in `every` is paint, the others metal."""
+    made = small(capture, folder, total=400)
+    count = made.state.learned.count
+    metal = torch.arange(count) % every > 0
+    put(made, albedo=albedo.logit(), metallic=torch.where(metal, raw_metallic(0.98), raw_metallic(0.02)), told=True)
+    part = made.state.part(metals.Metals)
+    part.found = part.colored = True
+    return made.state, metal
+
+
+def test_a_few_surfels_that_mirror_the_object_tell_of_their_piece():
+    found, metal = ball(lambda i: i % 10 == 0)
+    told = base_colors.told(found, metal)
+    assert torch.allclose(told[metal, :3], torch.tensor(0.8), atol=1e-3) and bool((told[metal, 3] > 0.1).all())
+    assert float(told[~metal, 3].median()) < 0.1, "the board is another piece"
+
+
+def test_metals_that_mirror_no_object_are_left_alone():
+    for few in (lambda i: i < 0, lambda i: i % 100 == 0):
+        found, metal = ball(few)
+        assert not base_colors.told(found, metal).any()
+
+
+def test_metals_are_drawn_to_what_they_show(large_ball, tmp_path):
+    shade = 0.1 + 0.2 * torch.rand(10**4, 3, generator=torch.Generator().manual_seed(0))
+    count = small(large_ball, tmp_path / "count", total=400).state.learned.count
+    state, metal = metal_and_paint(tmp_path / "run", large_ball, shade[:count])
+    unknown = metal & (torch.arange(count) % 2 > 0)
+    state.learned["shown_color"].data.copy_(torch.tensor([0.9, 0.6, 0.3, 1.0]) * ~unknown[:, None])
+    for _ in range(40):
+        do(state, ROW, 0.3, done=120)
+    now = state.surfels().albedo.detach()
+    assert torch.allclose(now[metal & ~unknown], torch.tensor([0.9, 0.6, 0.3]), atol=1e-3)
+    assert torch.allclose(now[unknown], shade[:count][unknown], atol=1e-5), "photos tell nothing of these"
+
+    snapshot.save(state)
+    again = small(large_ball, tmp_path / "again", total=400).state
+    snapshot.restore(again, state.folder)
+    assert torch.equal(again.learned["shown_color"], state.learned["shown_color"])
+
+
+def test_neighbouring_paint_is_averaged_but_not_with_metal(large_ball, tmp_path):
+    state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.3, 0.3, 0.3]), every=2)
+    speckled = torch.where(
+        torch.rand(len(metal), 1, generator=torch.Generator().manual_seed(0)) < 0.5, 0.1, 0.3
+    ).expand(-1, 3)
+    state.learned["albedo"].data.copy_(torch.where(metal[:, None], 0.9, speckled).logit())
+    do(state, "average paint's base colours", 0.3, done=120)
+    now = state.surfels().albedo.detach()
+    assert torch.allclose(now[metal], torch.tensor(0.9), atol=1e-4)
+    assert float(now[~metal].log().std()) < 0.3 * float(speckled[~metal].log().std())
+    assert float(now[~metal].min()) > 0.1 and float(now[~metal].max()) < 0.3
+
+
+def test_white_paint_under_dim_lamps_is_darker_under_brighter_lamps(large_ball, tmp_path):
+    """Check that paint's base colour times the light's power is kept, in each channel, and that dark walls are left as they are."""
+    state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.9, 0.8, 0.7]), every=2)
+    light = state.learned["environment"]
+    lamps = torch.arange(len(light)) < len(light) // 20
+    light.data.copy_(torch.where(lamps[:, None], torch.tensor([8.0, 4.0, 3.0]), 0.1).log())
+    area = cubemap.texel_solid_angles(state.environment().resolution).view(-1, 1)
+
+    def power():
+        return (light.detach().exp() * area).sum(dim=0)
+
+    before, colour = power(), state.surfels().albedo.detach()[~metal].mean(dim=0)
+    for _ in range(60):
+        do(state, ROW, 0.3, done=120)
+    now = state.surfels().albedo.detach()[~metal].mean(dim=0)
+    assert torch.allclose(now * power(), colour * before, rtol=1e-3)
+    assert torch.allclose(light.detach()[~lamps].exp(), torch.tensor(0.1))
+    assert float(now.max()) < base_colors.PAINT + 0.02
+    assert power().std() / power().mean() < before.std() / before.mean(), "the light is greyer"
+
+
+def test_a_light_without_lamps_is_kept(large_ball, tmp_path):
+    state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.9, 0.8, 0.7]))
+    light = state.learned["environment"].detach().fill_(-1.0).clone()
+    do(state, ROW, 0.3, done=120)
+    assert torch.equal(state.learned["environment"], light)
+    assert torch.allclose(state.surfels().albedo[~metal], torch.tensor([0.9, 0.8, 0.7]), atol=1e-5)
+
+
+def test_base_colours_stay_below_one(large_ball, tmp_path):
+    made = small(large_ball, tmp_path / "run", total=400)
+    state = made.state
+    put(made, albedo=torch.tensor([20.0, 0.0, -40.0]), metallic=raw_metallic(0.98), told=True)
+    metal = torch.ones(state.learned.count, dtype=torch.bool)
+    state.learned["shown_color"].data.fill_(1.0)
+    base_colors.keep(state, metal, ~metal)
+    assert bool(state.learned["albedo"].isfinite().all()) and float(state.surfels().albedo.detach().max()) <= 0.981
+
+
+def test_base_colours_start_at_what_photos_show(large_ball, tmp_path):
+    """Check that the start's picture, lit by the start's light, is about the photos' mean."""
+    state = small(large_ball, tmp_path / "run", total=400).state
+    light = state.environment().radiance.mean(dim=0)
+    shown = torch.stack(
+        [(p.linear * (p.mask[..., None] > 127)).sum(dim=(0, 1)) / (p.mask > 127).sum() for p in state.photos]
+    )
+    expected = (shown.mean(dim=0) / light).clamp(0.02, 0.98)
+    assert torch.allclose(state.surfels().albedo.detach().mean(dim=0), expected, rtol=0.25)
+    assert float(state.surfels().albedo.detach().std(dim=0).max()) > 0.01, "not one grey"
