@@ -21,6 +21,7 @@ from .run_parts import FOLDER, folder_of
 from .splat_cloud import MATERIALS, SH_DC, finite_rows, linear_to_srgb, read_constants, srgb_to_linear
 
 KEPT = ("environment.exr", "cameras.json", "needs.json", "occluder.ply", "run.toml")
+SURFELS = "comment SplatRenderMode: 2dgs\n"  # by which Brush, and programs after it, mark surfels
 DARK = 0.02  # a darker base colour does not reveal how much light falls on it
 
 
@@ -87,6 +88,7 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
     types = {np.dtype(kind): name for name, kind in PLY_TYPES.items()}
     names = "".join(f"property {types[rows.dtype[name]]} {name}\n" for name in rows.dtype.names)
     said = "".join(f"comment constant {name} {value:g}\n" for name, value in constants.items())
+    said = said if "scale_2" in rows.dtype.names else SURFELS + said
     head = f"ply\nformat binary_little_endian 1.0\n{said}element vertex {len(rows)}\n{names}end_header\n"
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write(head.encode("ascii"))

@@ -24,7 +24,8 @@ def move_to_header(folder, constants):
     data = PlyData.read(str(file))["vertex"].data
     rows = data[[name for name in data.dtype.names if name not in constants]].copy()
     names = "".join(f"property float {name}\n" for name in rows.dtype.names)
-    said = "".join(f"comment constant {name} {value:g}\n" for name, value in constants.items())
+    said = "comment SplatRenderMode: 2dgs\n"
+    said += "".join(f"comment constant {name} {value:g}\n" for name, value in constants.items())
     packed = np.stack([rows[name] for name in rows.dtype.names], axis=1).astype("<f4")
     head = f"ply\nformat binary_little_endian 1.0\n{said}element vertex {len(rows)}\n{names}end_header\n"
     file.write_bytes(head.encode() + packed.tobytes())

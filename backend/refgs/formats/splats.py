@@ -64,6 +64,7 @@ class Splats:
 _HEAD = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 _TAIL = ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
 THIN = 0.05  # third scale of a surfel in 3DGS viewers, as a part of its smaller scale
+SURFELS = "SplatRenderMode: 2dgs"  # comment by which Brush, and programs after it, mark surfels: there is no scale_2
 CHUNK = 4096  # rows copied at a time; they fit the processor's cache
 _RECEIVED = ["received_r", "received_g", "received_b"]
 _DOUBT = "doubt"
@@ -82,7 +83,7 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
     """Write splats as a binary little-endian PLY file (docs/formats.md). Elements in `splats.others` are written too.
 
     Values are encoded as 3DGS viewers expect: opacities as logits, scales as logarithms, and spherical harmonics of degree 1 and above in
-    channel-major order. Materials are stored unchanged. Opacities are clipped to 1e-6 .. 1 - 1e-6.
+    channel-major order. Materials are stored unchanged. Opacities are clipped to 1e-6 .. 1 - 1e-6. A comment marks surfels (SURFELS).
     """
     names, columns = _common_columns(splats, splats.scales)
     names += _MATERIAL[:3]
@@ -97,9 +98,10 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
     if splats.indirect.shape[1]:
         names += [*_RECEIVED, *(f"ind_{i}" for i in range(3 * splats.indirect.shape[1]))]
         columns += [splats.received, splats.indirect.transpose(0, 2, 1)]
-    _write(
-        path, names, columns, splats.others, [f"constant {name} {value:g}" for name, value in splats.constants.items()]
-    )
+    comments = [f"constant {name} {value:g}" for name, value in splats.constants.items()]
+    if splats.scales.shape[1] == 2:
+        comments.insert(0, SURFELS)
+    _write(path, names, columns, splats.others, comments)
 
 
 def write_display_splats(path: str | os.PathLike, splats: Splats) -> None:
