@@ -71,15 +71,13 @@ class ExportSplats(_Export, bpy.types.Operator):
     kind, filename_ext = "splats", ".ply"
 
 
-class ExportDisplaySplats(_Export, bpy.types.Operator):
-    bl_idname = "refgs.export_display_splats"
-    bl_label = "RefGS Display Splats (.ply)"
+class _ExportDisplaySplats(_Export):
     bl_description = (
         "Let the trainer make splats for viewers without lights, in the colours of the edited run "
         "under the recovered light"
     )
 
-    kind, filename_ext = "display splats", ".ply"
+    kind = "display splats"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -89,6 +87,20 @@ class ExportDisplaySplats(_Export, bpy.types.Operator):
         file = Path(bpy.path.abspath(self.filepath))
         training.export_display_splats(active_run(context), file)
         self.report({"INFO"}, f"Making {file.name}: the Train panel shows the progress")
+
+
+class ExportDisplaySplats(_ExportDisplaySplats, bpy.types.Operator):
+    bl_idname = "refgs.export_display_splats"
+    bl_label = "RefGS Display Splats (.ply)"
+
+    filename_ext = ".ply"
+
+
+class ExportDisplaySplatsGltf(_ExportDisplaySplats, bpy.types.Operator):
+    bl_idname = "refgs.export_display_splats_gltf"
+    bl_label = "RefGS Display Splats (.glb)"
+
+    filename_ext = ".glb"
 
 
 class _ExportMesh(_Export):
@@ -198,7 +210,10 @@ class ApplyEdits(_Export, bpy.types.Operator):
             warn_of_deleted(self, active_run(context))
 
 
-FILES = (ExportSplats, ExportDisplaySplats, ExportMesh, ExportMeshUsd, ExportMeshFbx, ExportLight)
+FILES = (
+    *(ExportSplats, ExportDisplaySplats, ExportDisplaySplatsGltf),
+    *(ExportMesh, ExportMeshUsd, ExportMeshFbx, ExportLight),
+)
 CLASSES = (*FILES, ApplyEdits)
 
 

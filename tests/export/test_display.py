@@ -18,6 +18,7 @@ from refgs.model.surfels import from_splats
 from refgs.render.renderer import render
 from refgs.run import open_run
 from tests.makers.ball import write_run
+from tests.makers.box import glb_chunks
 from tests.makers.splats import chosen, make
 
 
@@ -83,6 +84,22 @@ def test_splats_alone_are_exported_unless_the_mesh_is_named(run, tmp_path, monke
         export(run.folder, None, None, None, tmp_path / "b.ply", False, lambda event, facts: None)
 
 
+@pytest.mark.parametrize(
+    ("mesh", "ours", "display", "said"),
+    [
+        (None, "a.glb", None, "a.glb: splats with materials are written as .ply"),
+        (None, None, "a.splat", "a.splat: display splats are written as .ply or .glb"),
+        (None, "a.ply", "a.ply", "a.ply is named twice"),
+        ("a.glb", None, "a.glb", "a.glb is named twice"),
+    ],
+)
+def test_wrong_names_are_refused_before_work(run, tmp_path, mesh, ours, display, said):
+    files = [name and tmp_path / name for name in (mesh, ours, display)]
+    with pytest.raises(InputError, match=said):
+        export(run.folder, files[0], 64, *files[1:], False, lambda event, facts: None)
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_run_of_few_splats_leaves_in_every_format(run, tmp_path, monkeypatch, count):
     """Check that a run of no splats, or of one, can be exported as splats.
@@ -101,6 +118,13 @@ def test_a_run_of_few_splats_leaves_in_every_format(run, tmp_path, monkeypatch, 
 
     for file in leave(None, folder / "les nôtres.ply", folder / "à voir.ply"):
         assert len(read_splats(file)) == count
+    if count:
+        (file,) = leave(display=folder / "à voir.GLB")
+        gltf, _ = glb_chunks(file)
+        assert gltf["accessors"][0]["count"] == count
+    else:  # glTF has no arrays of length zero
+        with pytest.raises(InputError, match="there are no splats to write"):
+            leave(display=folder / "à voir.glb")
     for file in (folder / "mesh.glb", tmp_path / "à part" / "la forme.obj"):
         with pytest.raises(InputError, match="there is no mesh"):
             leave(file)

@@ -11,8 +11,12 @@ from plyfile import PlyData
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from refgs.color import srgb_encode
+from refgs.export.turned import turned
 from refgs.formats.gltf import write_glb
+from refgs.formats.mesh import Y_UP
 from refgs.formats.splats import Splats, read_splats, write_display_splats, write_splats
+from refgs.formats.splats_gltf import write_splats_glb
 from tests.makers.box import glb_chunks, textured_box
 
 TOOLS = Path(__file__).parents[1] / "tools"
@@ -115,36 +119,59 @@ def test_few_splats_open_too(tmp_path, count):
     assert len(read_splats(tmp_path / "c.ply")) == count
 
 
-def test_gltf_of_splats(tmp_path):
-    """Check the glTF file (KHR_gaussian_splatting) that splat-transform makes from exported splats.
-
-    The file holds scales and opacities, not their logarithms and logits. With the rotation that docs/formats.md recommends, +Y is up.
-    """
-    splats = discs()
-    write_display_splats(tmp_path / "a.ply", splats)
-    transform(tmp_path / "a.ply", tmp_path / "a.glb", "-r", "-90,0,0")
-    gltf, binary = glb_chunks(tmp_path / "a.glb")
-    assert "KHR_gaussian_splatting" in gltf["extensionsUsed"]
+def vertex_attributes(file):
+    """Read a glTF file's only primitive: return its attributes by name as arrays, and the primitive."""
+    gltf, binary = glb_chunks(file)
     (primitive,) = gltf["meshes"][0]["primitives"]
-    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
-
-    def values(name, width):
-        accessor = gltf["accessors"][primitive["attributes"][name]]
-        assert accessor["componentType"] == 5126 and accessor["count"] == COUNT
+    found = {}
+    for name, number in primitive["attributes"].items():
+        accessor = gltf["accessors"][number]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        kind = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
         view = gltf["bufferViews"][accessor["bufferView"]]
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        assert view.get("byteStride", 4 * width) == 4 * width
-        return np.frombuffer(binary, "<f4", COUNT * width, start).reshape(COUNT, width)
+        assert view.get("byteStride", width * np.dtype(kind).itemsize) == width * np.dtype(kind).itemsize
+        found[name] = np.frombuffer(binary, kind, accessor["count"] * width, start).reshape(-1, width)
+    return found, primitive
 
-    scales = np.exp(np.stack([rows[f"scale_{i}"] for i in range(3)], axis=1))
-    order = cKDTree(values("KHR_gaussian_splatting:SCALE", 3)).query(scales)[1]
-    np.testing.assert_allclose(values("KHR_gaussian_splatting:SCALE", 3)[order], scales, rtol=1e-5)
-    x, y, z = splats.positions.T
-    constant = values("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0", 3)[order]
-    # glTF's up axis is +Y.
-    np.testing.assert_allclose(values("POSITION", 3)[order], np.stack([-x, z, y], axis=1), atol=1e-6)
-    np.testing.assert_allclose(values("KHR_gaussian_splatting:OPACITY", 1)[order, 0], splats.opacities, atol=1e-5)
-    np.testing.assert_allclose(constant, splats.sh[:, 0], atol=1e-6)
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_gltf_of_splats(tmp_path, degree):
+    """Compare splats in glTF with those that splat-transform makes of the same display splats.
+
+    splat-transform takes a PLY to be upside down: two turns bring its splats to glTF's axes.
+    """
+    splats = discs(degree=degree)
+    write_display_splats(tmp_path / "a.ply", splats)
+    transform(tmp_path / "a.ply", tmp_path / "theirs.glb", "-r", "-90,0,0", "-r", "0,180,0")
+    write_splats_glb(tmp_path / "ours.glb", turned(splats, Y_UP))
+    (ours, primitive), (theirs, their_primitive) = (
+        vertex_attributes(tmp_path / f"{n}.glb") for n in ("ours", "theirs")
+    )
+    assert {name for name in ours if name[0] != "_"} == {*theirs} and len(theirs) == 5 + (degree + 1) ** 2
+    assert primitive["mode"] == 0
+    khr, their_khr = (p["extensions"]["KHR_gaussian_splatting"] for p in (primitive, their_primitive))
+    assert {name: khr[name] for name in ("kernel", "colorSpace")}.items() <= their_khr.items()
+    nearest = cKDTree(theirs["POSITION"]).query(ours["POSITION"])[1]
+    assert len(np.unique(nearest)) == COUNT
+    for name in {*theirs} - {"COLOR_0", "KHR_gaussian_splatting:ROTATION"}:
+        np.testing.assert_allclose(ours[name], theirs[name][nearest], rtol=2e-5, atol=2e-6, err_msg=name)
+    turns = [Rotation.from_quat(values["KHR_gaussian_splatting:ROTATION"]) for values in (ours, theirs)]
+    assert np.degrees((turns[1][nearest].inv() * turns[0]).magnitude()).max() < 0.05
+    # By the extension's text COLOR_0 is linear. splat-transform leaves it encoded.
+    encoded = srgb_encode(ours["COLOR_0"][:, :3])
+    np.testing.assert_allclose(encoded, theirs["COLOR_0"][nearest, :3] / 255, atol=0.5 / 255 + 1e-4)
+    np.testing.assert_allclose(ours["COLOR_0"][:, 3:], ours["KHR_gaussian_splatting:OPACITY"], atol=1e-6)
+
+
+def test_gltf_of_splats_is_valid(tmp_path):
+    write_splats_glb(tmp_path / "des éclats.glb", discs())
+    report = json.loads(said("validate.js", tmp_path / "des éclats.glb"))
+    issues = [m for m in report["issues"]["messages"] if m["severity"] < 2]
+    # The validator does not know the extension yet, nor the names that it gives attributes.
+    assert {m["code"] for m in issues} == {"MESH_PRIMITIVE_INVALID_ATTRIBUTE"}
+    assert all("attributes/KHR_gaussian_splatting:" in m["pointer"] for m in issues)
+    assert len(issues) == 3 + 16 and report["info"]["totalVertexCount"] == COUNT
 
 
 @pytest.mark.parametrize("specular", [1.0, 0.0])

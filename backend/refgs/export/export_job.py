@@ -15,6 +15,7 @@ from refgs.memory import shortage_named
 from refgs.paths import disk_errors_named, make_folders
 from refgs.run_folder import check_finished
 
+DISPLAY = (".ply", ".glb")  # of display splats
 LESS = "close other programs, or export less: a smaller --texture, or train with a smaller mesh.resolution"
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def export(
     - mesh_file: a .glb or .obj file. If all three files are None, the mesh is written to mesh.glb in the run folder.
     - texture: the side of the textures in texels; None means the side in the run's settings
     - splats_file: a .ply file for the splats with their materials
-    - display_file: a .ply file for splats without materials, for viewers that compute no lighting
+    - display_file: a .ply or .glb file for splats that viewers without lighting show
     - overwrite: replace files that exist. If it is false and a file exists, InputError is raised.
     - report: a function that is called with each step, the progress and warnings
     """
@@ -51,7 +52,7 @@ def export(
     if is_run:
         check_finished(folder)
     target = mesh_file if mesh_file or splats else folder / "mesh.glb"
-    _check_names(target, splats)
+    _check_names(target, splats_file, display_file)
     _check_absent([*splats, *_mesh_files(target)], overwrite)
     run, source = _read_source(folder, is_run, report)
     folders = [file.parent for file in [*splats, target] if file]
@@ -65,12 +66,17 @@ def export(
     return [*splats, target]
 
 
-def _check_names(target: Path | None, splats: list[Path]) -> None:
+def _check_names(target: Path | None, ours: Path | None, display: Path | None) -> None:
     if target is not None and target.suffix.lower() not in (".glb", ".obj"):
         raise InputError(f"{target}: a mesh is written as .glb or .obj; give it a name that ends so")
-    for file in splats:
-        if file.suffix.lower() != ".ply" or splats.count(file) > 1:
-            raise InputError(f"{file}: splats are written as .ply, each to a file of its own")
+    if ours is not None and ours.suffix.lower() != ".ply":
+        raise InputError(f"{ours}: splats with materials are written as .ply; give it a name that ends so")
+    if display is not None and display.suffix.lower() not in DISPLAY:
+        raise InputError(
+            f"{display}: display splats are written as {' or '.join(DISPLAY)}; give it a name that ends so"
+        )
+    if display is not None and display in (target, ours):
+        raise InputError(f"{display} is named twice: give each export a file of its own")
 
 
 def _mesh_files(target: Path | None) -> list[Path]:
@@ -105,7 +111,10 @@ def _read_source(folder: Path, is_run: bool, report: Report) -> "tuple[Run | Non
 
 def _write_splats(run: "Run | None", source: "Splats", ours: Path | None, display: Path | None, report: Report) -> None:
     from refgs.export.display import displayed
+    from refgs.export.turned import turned
+    from refgs.formats.mesh import Y_UP
     from refgs.formats.splats import write_display_splats, write_splats
+    from refgs.formats.splats_gltf import write_splats_glb
 
     def learned(done: int, total: int) -> None:
         if done % 10 == 0:
@@ -115,11 +124,13 @@ def _write_splats(run: "Run | None", source: "Splats", ours: Path | None, displa
         write_splats(ours, source)
     if display is None:
         return
-    if run is None:
-        write_display_splats(display, source)  # a foreign PLY has its colours by direction
-    else:
+    if run is not None:  # a foreign PLY has its colours by direction
         report("stage", {"what": "learning colours by direction"})
-        write_display_splats(display, displayed(run, learned))
+        source = displayed(run, learned)
+    if display.suffix.lower() == ".glb":
+        write_splats_glb(display, turned(source, Y_UP))
+    else:
+        write_display_splats(display, source)
 
 
 def _write_mesh(run: "Run", target: Path, texture: int | None, report: Report) -> None:

@@ -105,14 +105,14 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
 
 
 def write_display_splats(path: str | os.PathLike, splats: Splats) -> None:
-    """Write splats as a binary little-endian PLY file for 3DGS viewers: colours and shapes, but no materials.
+    """Write splats as a binary little-endian PLY file for 3DGS viewers: colours and shapes (`three_scales`), but no materials."""
+    _write(path, *_common_columns(splats, three_scales(splats)))
 
-    These viewers need three scales and hide a splat with scale 0. So a surfel's third scale is THIN times its smaller one.
-    """
+
+def three_scales(splats: Splats) -> np.ndarray:
+    """Return splats' scales (N, 3) for 3DGS viewers, which hide a splat with scale 0. A surfel's third is THIN times its smaller one."""
     scales = splats.scales
-    if scales.shape[1] == 2:
-        scales = np.column_stack([scales, THIN * scales.min(axis=1)])
-    _write(path, *_common_columns(splats, scales))
+    return scales if scales.shape[1] == 3 else np.column_stack([scales, THIN * scales.min(axis=1)])
 
 
 def _common_columns(splats: Splats, scales: np.ndarray) -> tuple[list[str], list[np.ndarray]]:
@@ -275,15 +275,21 @@ def _third_axis(rotations: np.ndarray) -> np.ndarray:
 def _shortest_last(rotations: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Reorder 3D Gaussians' axes so that the shortest, the normal, is the third."""
     shortest = np.where(scales[:, 2] <= scales.min(axis=1), 2, scales.argmin(axis=1))
-    w, x, y, z = rotations.T
-    a, b, c, d = _TO_THIRD[shortest].T
-    turned = [
+    turned = quaternion_product(rotations, _TO_THIRD[shortest])
+    return turned, np.take_along_axis(scales, (shortest[:, None] + np.arange(1, 4)) % 3, axis=1)
+
+
+def quaternion_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Multiply quaternions wxyz (..., 4): turn by `right`, then by `left`."""
+    w, x, y, z = np.moveaxis(left, -1, 0)
+    a, b, c, d = np.moveaxis(right, -1, 0)
+    product = [
         w * a - x * b - y * c - z * d,
         w * b + x * a + y * d - z * c,
         w * c - x * d + y * a + z * b,
         w * d + x * c - y * b + z * a,
     ]
-    return np.stack(turned, axis=1), np.take_along_axis(scales, (shortest[:, None] + np.arange(1, 4)) % 3, axis=1)
+    return np.stack(product, axis=-1)
 
 
 def _other_elements(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[PlyElement, ...]:
