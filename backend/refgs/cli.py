@@ -159,14 +159,14 @@ def evaluate(
 
 @app.command()
 def export(
-    run: Annotated[Path, typer.Argument(help="run folder, or PLY file of splats by any program")],
+    run: Annotated[Path, typer.Argument(help="run folder, or file of splats by any program, .ply or .spz")],
     mesh: Annotated[Path | None, typer.Option(help="mesh file, .glb or .obj (default: RUN/mesh.glb)")] = None,
     texture: Annotated[int | None, typer.Option(min=64, max=8192, help="side of the textures, in pixels")] = None,
     splats: Annotated[Path | None, typer.Option(help="write the splats to this file")] = None,
     display_splats: Annotated[
         Path | None,
         typer.Option(
-            help="write splats for viewers of 3D Gaussians, .ply or .glb, with the light baked into their colours"
+            help="write splats for viewers of 3D Gaussians, .ply, .glb or .spz, with the light baked into their colours"
         ),
     ] = None,
     overwrite: Annotated[bool, typer.Option(help="replace files that exist")] = False,

@@ -103,6 +103,13 @@ class ExportDisplaySplatsGltf(_ExportDisplaySplats, bpy.types.Operator):
     filename_ext = ".glb"
 
 
+class ExportDisplaySplatsSpz(_ExportDisplaySplats, bpy.types.Operator):
+    bl_idname = "refgs.export_display_splats_spz"
+    bl_label = "RefGS Display Splats (.spz)"
+
+    filename_ext = ".spz"
+
+
 class _ExportMesh(_Export):
     kind = "mesh"
 
@@ -211,7 +218,7 @@ class ApplyEdits(_Export, bpy.types.Operator):
 
 
 FILES = (
-    *(ExportSplats, ExportDisplaySplats, ExportDisplaySplatsGltf),
+    *(ExportSplats, ExportDisplaySplats, ExportDisplaySplatsGltf, ExportDisplaySplatsSpz),
     *(ExportMesh, ExportMeshUsd, ExportMeshFbx, ExportLight),
 )
 CLASSES = (*FILES, ApplyEdits)

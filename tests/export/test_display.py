@@ -14,6 +14,7 @@ from refgs.errors import InputError
 from refgs.export.display import displayed
 from refgs.export.export_job import export
 from refgs.formats.splats import THIN, read_splats, write_display_splats, write_splats
+from refgs.formats.spz import read_spz
 from refgs.model.surfels import from_splats
 from refgs.render.renderer import render
 from refgs.run import open_run
@@ -88,7 +89,7 @@ def test_splats_alone_are_exported_unless_the_mesh_is_named(run, tmp_path, monke
     ("mesh", "ours", "display", "said"),
     [
         (None, "a.glb", None, "a.glb: splats with materials are written as .ply"),
-        (None, None, "a.splat", "a.splat: display splats are written as .ply or .glb"),
+        (None, None, "a.splat", "a.splat: display splats are written as .ply, .glb or .spz"),
         (None, "a.ply", "a.ply", "a.ply is named twice"),
         ("a.glb", None, "a.glb", "a.glb is named twice"),
     ],
@@ -118,6 +119,8 @@ def test_a_run_of_few_splats_leaves_in_every_format(run, tmp_path, monkeypatch, 
 
     for file in leave(None, folder / "les nôtres.ply", folder / "à voir.ply"):
         assert len(read_splats(file)) == count
+    (file,) = leave(display=folder / "à voir.spz")
+    assert len(read_spz(file)) == count
     if count:
         (file,) = leave(display=folder / "à voir.GLB")
         gltf, _ = glb_chunks(file)

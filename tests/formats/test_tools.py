@@ -15,9 +15,11 @@ from refgs.color import srgb_encode
 from refgs.export.turned import turned
 from refgs.formats.gltf import write_glb
 from refgs.formats.mesh import Y_UP
-from refgs.formats.splats import Splats, read_splats, write_display_splats, write_splats
+from refgs.formats.splats import Splats, read_splats, three_scales, write_display_splats, write_splats
 from refgs.formats.splats_gltf import write_splats_glb
+from refgs.formats.spz import read_spz, write_spz
 from tests.makers.box import glb_chunks, textured_box
+from tests.makers.splats import arrays
 
 TOOLS = Path(__file__).parents[1] / "tools"
 COUNT = 600
@@ -85,13 +87,17 @@ def test_display_splats_in_other_formats_and_back(tmp_path, ending):
     if ending != ".ply":
         assert there.stat().st_size < 0.6 * (tmp_path / "des éclats.ply").stat().st_size
     transform(there, tmp_path / "back.ply")
-    before, after = (read_splats(tmp_path / name) for name in ("des éclats.ply", "back.ply"))
+    compare(*(read_splats(tmp_path / name) for name in ("des éclats.ply", "back.ply")), ending)
+
+
+def compare(before, after, ending):
+    """Check that `after` are the splats `before`, within what the format of files that end with `ending` quantises."""
     # Converting may reorder the splats: match them by position.
     nearest = cKDTree(after.positions).query(before.positions)[1]
     assert len(after) == COUNT and len(np.unique(nearest)) == COUNT
     position, scale, angle, opacity, colour, direction = QUANTISED[ending]
     assert np.abs(after.positions[nearest] - before.positions).max() <= position
-    assert np.abs(np.log(after.scales[nearest]) - np.log(before.scales)).max() <= scale
+    assert np.abs(np.log(after.scales[nearest]) - np.log(three_scales(before))).max() <= scale
     turns = [Rotation.from_quat(s.rotations[:, [1, 2, 3, 0]]) for s in (after, before)]
     assert np.degrees((turns[0][nearest].inv() * turns[1]).magnitude()).max() <= angle
     assert np.abs(after.opacities[nearest] - before.opacities).max() <= opacity
@@ -172,6 +178,24 @@ def test_gltf_of_splats_is_valid(tmp_path):
     assert {m["code"] for m in issues} == {"MESH_PRIMITIVE_INVALID_ATTRIBUTE"}
     assert all("attributes/KHR_gaussian_splatting:" in m["pointer"] for m in issues)
     assert len(issues) == 3 + 16 and report["info"]["totalVertexCount"] == COUNT
+
+
+@pytest.mark.parametrize("version", ["3", "4"])
+def test_spz_of_another_program(tmp_path, version):
+    """Read SPZ that splat-transform writes, and compare with the PLY that it makes of that. It does not turn axes between the two."""
+    write_display_splats(tmp_path / "a.ply", discs())
+    transform(tmp_path / "a.ply", tmp_path / "b.spz", "--spz-version", version)
+    transform(tmp_path / "b.spz", tmp_path / "b.ply")
+    ours, theirs = read_spz(tmp_path / "b.spz"), read_splats(tmp_path / "b.ply")
+    for name, value in arrays(theirs).items():
+        np.testing.assert_allclose(getattr(ours, name), value, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+def test_another_program_reads_our_spz(tmp_path):
+    splats = discs()
+    write_spz(tmp_path / "a.spz", splats)
+    transform(tmp_path / "a.spz", tmp_path / "b.ply")
+    compare(splats, read_splats(tmp_path / "b.ply"), ".spz")
 
 
 @pytest.mark.parametrize("specular", [1.0, 0.0])

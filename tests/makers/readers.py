@@ -44,6 +44,7 @@ from refgs.formats.metrics import read_metrics
 from refgs.formats.needs import Needs
 from refgs.formats.panorama import read_environment
 from refgs.formats.splats import read_splats, write_display_splats, write_splats
+from refgs.formats.spz import read_spz, write_spz
 from refgs.formats.validate import read_json
 from refgs.geometry.visibility import Occluder
 from refgs.lock import PROGRESS
@@ -62,6 +63,7 @@ from tests.makers.films import film_ball
 from tests.makers.models import write_model
 from tests.makers.profiles import DISPLAY_P3, gamma, matrix_profile, table_profile
 from tests.makers.splats import make
+from tests.makers.spz import write_spz_2
 from tests.makers.training import TINY, trained, trainer
 
 CAMERA = Camera("a", 16, 12, 15.0, 15.0, 8.0, 6.0, np.linalg.inv(ring(1)[0] @ captures.FLIP))
@@ -414,6 +416,12 @@ READERS: dict[str, Reader] = {
     ),
     "splats": Reader(_ply_splats("ours"), "a.ply", "bytes", lambda f: read_splats(f / "a.ply"), 2),
     "splats of 3DGS": Reader(_ply_splats("3dgs"), "a.ply", "bytes", lambda f: read_splats(f / "a.ply")),
+    "splats in SPZ": Reader(
+        lambda f: write_spz(f / "a.spz", make(5, 4)), "a.spz", "bytes", lambda f: read_spz(f / "a.spz")
+    ),
+    "splats in SPZ of version 2": Reader(
+        lambda f: write_spz_2(f / "a.spz", make(5, 4)), "a.spz", "bytes", lambda f: read_spz(f / "a.spz")
+    ),
     "splats in text": Reader(_ply_splats("text"), "a.ply", "text", lambda f: read_splats(f / "a.ply")),
     "a mesh": Reader(
         lambda f: write_mesh(f / "a.ply", _box()), "a.ply", "bytes", lambda f: Occluder(read_mesh(f / "a.ply"))

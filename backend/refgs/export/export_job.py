@@ -15,7 +15,8 @@ from refgs.memory import shortage_named
 from refgs.paths import disk_errors_named, make_folders
 from refgs.run_folder import check_finished
 
-DISPLAY = (".ply", ".glb")  # of display splats
+DISPLAY = (".ply", ".glb", ".spz")  # of display splats
+THEIRS = (".ply", ".spz")  # of splats by other programs
 LESS = "close other programs, or export less: a smaller --texture, or train with a smaller mesh.resolution"
 
 if TYPE_CHECKING:
@@ -35,16 +36,16 @@ def export(
 ) -> list[Path]:
     """Export the textured mesh of a run, its splats, or both. Returns the files written.
 
-    - folder: a run folder (the result of a training), or a PLY file of splats, which has no mesh to export
+    - folder: a run folder (the result of a training), or a file of splats, .ply or .spz, which has no mesh to export
     - mesh_file: a .glb or .obj file. If all three files are None, the mesh is written to mesh.glb in the run folder.
     - texture: the side of the textures in texels; None means the side in the run's settings
     - splats_file: a .ply file for the splats with their materials
-    - display_file: a .ply or .glb file for splats that viewers without lighting show
+    - display_file: a .ply, .glb or .spz file for splats that viewers without lighting show
     - overwrite: replace files that exist. If it is false and a file exists, InputError is raised.
     - report: a function that is called with each step, the progress and warnings
     """
     splats = [file for file in (splats_file, display_file) if file is not None]
-    is_run = folder.is_dir() or folder.suffix.lower() != ".ply"
+    is_run = folder.is_dir() or folder.suffix.lower() not in THEIRS
     if not is_run and (mesh_file or not splats):
         raise InputError(
             f"{folder} is no run folder, so there is no mesh: add --splats FILE.ply or --display-splats FILE.ply"
@@ -72,9 +73,7 @@ def _check_names(target: Path | None, ours: Path | None, display: Path | None) -
     if ours is not None and ours.suffix.lower() != ".ply":
         raise InputError(f"{ours}: splats with materials are written as .ply; give it a name that ends so")
     if display is not None and display.suffix.lower() not in DISPLAY:
-        raise InputError(
-            f"{display}: display splats are written as {' or '.join(DISPLAY)}; give it a name that ends so"
-        )
+        raise InputError(f"{display}: display splats are written as .ply, .glb or .spz; give it a name that ends so")
     if display is not None and display in (target, ours):
         raise InputError(f"{display} is named twice: give each export a file of its own")
 
@@ -96,14 +95,22 @@ def _check_absent(files: list[Path], overwrite: bool) -> None:
 
 
 def _read_source(folder: Path, is_run: bool, report: Report) -> "tuple[Run | None, Splats]":
-    """Read a run (None for a PLY) and its splats, sending warnings to `report`."""
+    """Read a run (None for a file of splats) and its splats, sending warnings to `report`."""
+    from refgs.export.turned import turned
+    from refgs.formats.mesh import Y_UP
     from refgs.formats.splats import read_splats
+    from refgs.formats.spz import read_spz
     from refgs.run import open_run
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         run = open_run(folder) if is_run else None
-        splats = run.splats if run else read_splats(folder)
+        if run is not None:
+            splats = run.splats
+        elif folder.suffix.lower() == ".spz":
+            splats = turned(read_spz(folder), Y_UP.T)
+        else:
+            splats = read_splats(folder)
     for warning in caught:
         report("warning", {"what": str(warning.message)})
     return run, splats
@@ -115,6 +122,7 @@ def _write_splats(run: "Run | None", source: "Splats", ours: Path | None, displa
     from refgs.formats.mesh import Y_UP
     from refgs.formats.splats import write_display_splats, write_splats
     from refgs.formats.splats_gltf import write_splats_glb
+    from refgs.formats.spz import write_spz
 
     def learned(done: int, total: int) -> None:
         if done % 10 == 0:
@@ -124,13 +132,16 @@ def _write_splats(run: "Run | None", source: "Splats", ours: Path | None, displa
         write_splats(ours, source)
     if display is None:
         return
-    if run is not None:  # a foreign PLY has its colours by direction
+    if run is not None:  # others' splats have their colours by direction
         report("stage", {"what": "learning colours by direction"})
         source = displayed(run, learned)
-    if display.suffix.lower() == ".glb":
-        write_splats_glb(display, turned(source, Y_UP))
-    else:
-        write_display_splats(display, source)
+    match display.suffix.lower():
+        case ".glb":
+            write_splats_glb(display, turned(source, Y_UP))
+        case ".spz":
+            write_spz(display, turned(source, Y_UP))
+        case _:
+            write_display_splats(display, source)
 
 
 def _write_mesh(run: "Run", target: Path, texture: int | None, report: Report) -> None:

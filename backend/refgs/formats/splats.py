@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.lib.recfunctions import repack_fields, structured_to_unstructured
-from plyfile import PlyElement, PlyListProperty, PlyProperty
+from plyfile import PlyData, PlyElement, PlyListProperty, PlyProperty
 
 from refgs.color import srgb_decode
 from refgs.errors import InputError, InputWarning
@@ -175,7 +175,11 @@ def read_splats(path: str | os.PathLike) -> Splats:
 
     Raises InputError if the file is missing, broken, or not a file of splats.
     """
-    data = read_ply(path)
+    return splats_of_ply(read_ply(path), path)
+
+
+def splats_of_ply(data: PlyData, path: str | os.PathLike) -> Splats:
+    """Return the splats of a PLY file that was read from `path`, as `read_splats` does. Raises InputError."""
     if "vertex" not in data:
         raise InputError(f"{path} has no element vertex: it is not a PLY file of splats")
     vertex = data["vertex"]
