@@ -166,7 +166,7 @@ def export(
     display_splats: Annotated[
         Path | None,
         typer.Option(
-            help="write splats for viewers of 3D Gaussians, .ply, .glb or .spz, with the light baked into their colours"
+            help="write splats for viewers of 3D Gaussians, .ply, .glb, .spz or .usdc, with the light baked into their colours"
         ),
     ] = None,
     overwrite: Annotated[bool, typer.Option(help="replace files that exist")] = False,

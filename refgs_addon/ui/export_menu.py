@@ -110,6 +110,13 @@ class ExportDisplaySplatsSpz(_ExportDisplaySplats, bpy.types.Operator):
     filename_ext = ".spz"
 
 
+class ExportDisplaySplatsUsd(_ExportDisplaySplats, bpy.types.Operator):
+    bl_idname = "refgs.export_display_splats_usd"
+    bl_label = "RefGS Display Splats (.usdc)"
+
+    filename_ext = ".usdc"
+
+
 class _ExportMesh(_Export):
     kind = "mesh"
 
@@ -218,7 +225,7 @@ class ApplyEdits(_Export, bpy.types.Operator):
 
 
 FILES = (
-    *(ExportSplats, ExportDisplaySplats, ExportDisplaySplatsGltf, ExportDisplaySplatsSpz),
+    *(ExportSplats, ExportDisplaySplats, ExportDisplaySplatsGltf, ExportDisplaySplatsSpz, ExportDisplaySplatsUsd),
     *(ExportMesh, ExportMeshUsd, ExportMeshFbx, ExportLight),
 )
 CLASSES = (*FILES, ApplyEdits)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
+from pxr import Usd
 
 from refgs.capture import read_capture
 from refgs.compare.metrics import psnr
@@ -14,6 +15,7 @@ from refgs.errors import InputError
 from refgs.export.display import displayed
 from refgs.export.export_job import export
 from refgs.formats.splats import THIN, read_splats, write_display_splats, write_splats
+from refgs.formats.splats_usd import PLACE
 from refgs.formats.spz import read_spz
 from refgs.model.surfels import from_splats
 from refgs.render.renderer import render
@@ -89,7 +91,7 @@ def test_splats_alone_are_exported_unless_the_mesh_is_named(run, tmp_path, monke
     ("mesh", "ours", "display", "said"),
     [
         (None, "a.glb", None, "a.glb: splats with materials are written as .ply"),
-        (None, None, "a.splat", "a.splat: display splats are written as .ply, .glb or .spz"),
+        (None, None, "a.splat", "a.splat: display splats are written as .ply, .glb, .spz or .usdc"),
         (None, "a.ply", "a.ply", "a.ply is named twice"),
         ("a.glb", None, "a.glb", "a.glb is named twice"),
     ],
@@ -119,6 +121,9 @@ def test_a_run_of_few_splats_leaves_in_every_format(run, tmp_path, monkeypatch, 
 
     for file in leave(None, folder / "les nôtres.ply", folder / "à voir.ply"):
         assert len(read_splats(file)) == count
+    (file,) = leave(display=folder / "à voir.usdc")
+    stage = Usd.Stage.Open(str(file))
+    assert len(stage.GetAttributeAtPath(f"{PLACE}.positions").Get()) == count
     (file,) = leave(display=folder / "à voir.spz")
     assert len(read_spz(file)) == count
     if count:

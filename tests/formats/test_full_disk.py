@@ -12,6 +12,7 @@ from refgs.formats.exr import write_exr
 from refgs.formats.gltf import write_glb
 from refgs.formats.splats import write_display_splats, write_splats
 from refgs.formats.splats_gltf import write_splats_glb
+from refgs.formats.splats_usd import write_splats_usd
 from refgs.formats.spz import write_spz
 from refgs.formats.textures import Textures
 from tests.makers.box import textured_box
@@ -32,6 +33,7 @@ WRITERS = {  # each writes at least `size` thousand bytes
     "display.ply": lambda path, size: write_display_splats(path, make(10 * size)),
     "display.glb": lambda path, size: write_splats_glb(path, make(10 * size)),
     "display.spz": lambda path, size: write_spz(path, make(16 * size)),
+    "display.usdc": lambda path, size: write_splats_usd(path, make(10 * size)),
     "environment.exr": lambda path, size: write_exr(path, RNG.random((2 * size, 4 * size, 3))),
     "mesh.glb": lambda path, size: noisy_box(path, 4 * size),
 }

@@ -15,7 +15,7 @@ from refgs.memory import shortage_named
 from refgs.paths import disk_errors_named, make_folders
 from refgs.run_folder import check_finished
 
-DISPLAY = (".ply", ".glb", ".spz")  # of display splats
+DISPLAY = (".ply", ".glb", ".spz", ".usdc")  # of display splats
 THEIRS = (".ply", ".spz")  # of splats by other programs
 LESS = "close other programs, or export less: a smaller --texture, or train with a smaller mesh.resolution"
 
@@ -40,7 +40,7 @@ def export(
     - mesh_file: a .glb or .obj file. If all three files are None, the mesh is written to mesh.glb in the run folder.
     - texture: the side of the textures in texels; None means the side in the run's settings
     - splats_file: a .ply file for the splats with their materials
-    - display_file: a .ply, .glb or .spz file for splats that viewers without lighting show
+    - display_file: a .ply, .glb, .spz or .usdc file for splats that viewers without lighting show
     - overwrite: replace files that exist. If it is false and a file exists, InputError is raised.
     - report: a function that is called with each step, the progress and warnings
     """
@@ -73,7 +73,9 @@ def _check_names(target: Path | None, ours: Path | None, display: Path | None) -
     if ours is not None and ours.suffix.lower() != ".ply":
         raise InputError(f"{ours}: splats with materials are written as .ply; give it a name that ends so")
     if display is not None and display.suffix.lower() not in DISPLAY:
-        raise InputError(f"{display}: display splats are written as .ply, .glb or .spz; give it a name that ends so")
+        raise InputError(
+            f"{display}: display splats are written as .ply, .glb, .spz or .usdc; give it a name that ends so"
+        )
     if display is not None and display in (target, ours):
         raise InputError(f"{display} is named twice: give each export a file of its own")
 
@@ -122,6 +124,7 @@ def _write_splats(run: "Run | None", source: "Splats", ours: Path | None, displa
     from refgs.formats.mesh import Y_UP
     from refgs.formats.splats import write_display_splats, write_splats
     from refgs.formats.splats_gltf import write_splats_glb
+    from refgs.formats.splats_usd import write_splats_usd
     from refgs.formats.spz import write_spz
 
     def learned(done: int, total: int) -> None:
@@ -140,6 +143,8 @@ def _write_splats(run: "Run | None", source: "Splats", ours: Path | None, displa
             write_splats_glb(display, turned(source, Y_UP))
         case ".spz":
             write_spz(display, turned(source, Y_UP))
+        case ".usdc":
+            write_splats_usd(display, source)
         case _:
             write_display_splats(display, source)
 
