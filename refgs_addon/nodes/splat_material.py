@@ -13,17 +13,18 @@ SPECULAR = "Specular IOR Level"  # the Principled BSDF's name
 _SURFACE = {"metallic": "Metallic", "roughness": "Roughness", "specular": SPECULAR}
 
 
-def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material:
+def splat_material(name: str, constants: dict[str, float], two_sided: bool = False) -> bpy.types.Material:
     """Make a Principled material for the quads of `nodes.splats_tree`. It reads each splat's base colour, metallic and roughness.
 
     `constants` maps "metallic", "roughness" or "specular" to one value for all splats. The material then uses this value, and not the
     splats' own.
 
-    The back of a splat is black, like the inside of a solid. A lit back would shine through the small gaps between the front splats.
+    The back of a splat is black, like the inside of a solid. A lit back would shine through the small gaps between the front splats. With
+    `two_sided`, each normal is turned to the viewer instead, for splats whose normals point to either side.
     """
     material = bpy.data.materials.new(name)
     tree = node_tree(material)
-    normal, front = _normal(tree)
+    normal, front = _normal(tree, two_sided)
     surface = add(
         tree,
         "ShaderNodeBsdfPrincipled",
@@ -36,9 +37,10 @@ def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material
     for key in ("metallic", "roughness"):
         if key not in constants:
             tree.links.new(_attribute(tree, key, FACTOR), surface.inputs[_SURFACE[key]])
-    black = add(tree, "ShaderNodeEmission", {"Strength": 0.0})
-    shader = add(tree, "ShaderNodeMixShader", {0: front, 1: out(black), 2: out(surface)})
-    _finish(material, out(shader))
+    if not two_sided:
+        black = add(tree, "ShaderNodeEmission", {"Strength": 0.0})
+        surface = add(tree, "ShaderNodeMixShader", {0: front, 1: out(black), 2: out(surface)})
+    _finish(material, out(surface))
     return material
 
 
@@ -91,8 +93,8 @@ def _attribute(tree: bpy.types.NodeTree, name: str, output: int) -> bpy.types.No
     return add(tree, "ShaderNodeAttribute", attribute_name=name).outputs[output]
 
 
-def _normal(tree: bpy.types.NodeTree) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
-    """Add nodes for a curved splat's world-space normal and visible side (1 front, 0 back)."""
+def _normal(tree: bpy.types.NodeTree, two_sided: bool) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
+    """Add nodes for a curved splat's world-space normal, with `two_sided` turned to the viewer, and visible side (1 front, 0 back)."""
     u_v = add(tree, "ShaderNodeSeparateXYZ", {"Vector": _attribute(tree, "gaussian", VECTOR)}).outputs
     centre = _attribute(tree, "normal", VECTOR)
     bent = vector_math(tree, "ADD", centre, scaled(tree, _attribute(tree, "normal_u", VECTOR), u_v["X"]))
@@ -103,8 +105,11 @@ def _normal(tree: bpy.types.NodeTree) -> tuple[bpy.types.NodeSocket, bpy.types.N
         return out(add(tree, "ShaderNodeVectorTransform", {"Vector": vector}, **kind))
 
     viewer = add(tree, "ShaderNodeNewGeometry").outputs["Incoming"]
-    front = math(tree, "GREATER_THAN", vector_math(tree, "DOT_PRODUCT", to_world(centre), viewer), 0.0)
+    facing = vector_math(tree, "DOT_PRODUCT", to_world(centre), viewer)
+    front = math(tree, "GREATER_THAN", facing, 0.0)
     bent = vector_math(tree, "NORMALIZE", to_world(bent))
+    if two_sided:
+        bent = scaled(tree, bent, math(tree, "SIGN", facing))
     # Near silhouettes the normal can point away from the viewer, and a BSDF would be black: it is turned until it is perpendicular.
     away = math(tree, "MINIMUM", vector_math(tree, "DOT_PRODUCT", bent, viewer), 0.0)
     return vector_math(tree, "NORMALIZE", vector_math(tree, "SUBTRACT", bent, scaled(tree, viewer, away))), front

@@ -22,6 +22,7 @@ from .splat_cloud import MATERIALS, SH_DC, finite_rows, linear_to_srgb, read_con
 
 KEPT = ("environment.exr", "cameras.json", "needs.json", "occluder.ply", "run.toml")
 SURFELS = "comment SplatRenderMode: 2dgs\n"  # by which Brush, and programs after it, mark surfels
+ADOPT = "give its splats materials with `refgs export FILE --splats FOLDER/splats.ply`, and import that folder"
 DARK = 0.02  # a darker base colour does not reveal how much light falls on it
 
 
@@ -61,8 +62,7 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
     if len(rows) != len(splats.data.points):
         raise InputError(f"{run_folder(collection)} has changed since it was imported: import it again")
     if not {*MATERIALS} <= {*rows.dtype.names, *constants}:
-        fix = "add them with `refgs export FILE.ply --splats splats.ply`, and import that file"
-        raise InputError(f"{source} has no materials to edit: {fix}")
+        raise InputError(f"{source} has no materials to edit: {ADOPT}")
     new = edited_materials(splats)
     if not len(new[ROW]):
         raise InputError(f"all splats of {collection.name} are deleted: restore some")
@@ -165,6 +165,8 @@ def _copy(file: Path, path: Path) -> None:
 def run_folder(collection: bpy.types.Collection) -> Path:
     """Find the run folder of an imported collection. Raises InputError where it is missing."""
     folder = folder_of(collection)
+    if folder is None and FOLDER not in collection:
+        raise InputError(f"{collection.name} is no run: {ADOPT}")
     if folder is None:
         lost = bpy.path.abspath(collection.get(FOLDER, ""))
         raise InputError(f"the run of {collection.name} is no longer at {lost}: press Find Run Folder in the panel Run")

@@ -18,9 +18,10 @@ from .capture_cameras import replace_cameras
 from .color_spaces import LINEAR_REC709, SRGB, set_color_space
 from .place_run import extent
 from .run_toml import capture_of
-from .splat_cloud import add_splats, cloud_attributes, normal_slopes, point_cloud, read_constants, read_splats
+from .splat_cloud import add_splats, cloud_attributes, is_ours, normal_slopes, point_cloud, read_constants, read_splats
 from .world_light import correct_diffuse, keep_world, light_with_recovered, load_panorama
 
+THEIRS = (".ply", ".spz")  # files of splats by other programs
 LAYERS = 64  # transparent quads that a ray passes in Cycles: 16 left splats a tenth too dark and blotched, 256 showed no more
 DEPTH = 0.005  # of a mesh under the splats, as a part of the run's longest side
 
@@ -48,31 +49,39 @@ class Run:
 def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     """Import a run folder, the result of a training, into a scene, as a new collection `RefGS NAME`.
 
-    splats.ply must exist. mesh.glb, environment.exr and cameras.json may be missing. The light becomes the scene's world, and the file
-    keeps the old world; the panorama is packed into it. If there is a mesh, it is shown and the splats are hidden: Blender shades each
-    splat by itself, which looks grainy on polished surfaces. `run_parts.show` switches between the two. The cameras are hidden. An Empty is
-    the parent of all objects. `trace_rays` sets up Eevee and Cycles. If `capture_cameras.show_cameras` added the cameras of the same
-    capture, the run's cameras replace them. If this function raises InputError, it leaves the open file unchanged.
+    In the folder, splats.ply must exist. mesh.glb, environment.exr and cameras.json may be missing. The light becomes the scene's world,
+    and the file keeps the old world; the panorama is packed into it. If there is a mesh, it is shown and the splats are hidden: Blender
+    shades each splat by itself, which looks grainy on polished surfaces. `run_parts.show` switches between the two. The cameras are hidden.
+    An Empty is the parent of all objects. `trace_rays` sets up Eevee and Cycles. If `capture_cameras.show_cameras` added the cameras of the
+    same capture, the run's cameras replace them. If this function raises InputError, it leaves the open file unchanged.
+
+    In the folder's place may be a file of splats, .ply or .spz. Splats of other programs have no materials and become matte. Their normals
+    are their shortest axes, which may point to either side, and are turned to the viewer.
     """
     folder = Path(folder)
-    if not folder.is_dir():
+    alone = folder.suffix.lower() in THEIRS and folder.is_file()
+    if not alone and not folder.is_dir():
         raise InputError(f"{folder} is not a folder: choose the folder that a RefGS run wrote")
     folder = Path(
         os.path.abspath(folder)
     )  # not resolved: by a link's target, a copied project would find the original's run
-    name = folder.name
-    splats, left_out = read_splats(folder / "splats.ply")
+    name, file = (folder.stem, folder) if alone else (folder.name, folder / "splats.ply")
+    splats, left_out = read_splats(file)
+    theirs = not is_ours(file)
     capture = capture_of(folder)
     frames = read_cameras(folder / "cameras.json", capture) if (folder / "cameras.json").exists() else []
     before, world, camera = data_blocks(), scene.world, scene.camera
     try:
         collection = bpy.data.collections.new(f"RefGS {name}")
-        collection[run_parts.FOLDER] = str(folder)
+        if not alone:
+            collection[run_parts.FOLDER] = str(folder)
+        if theirs:
+            collection[run_parts.THEIRS] = True
         if words := _doubt_words(folder):
             collection[run_parts.DOUBT] = words
         scene.collection.children.link(collection)
         cloud = point_cloud(f"{name} splats", cloud_attributes(splats, *normal_slopes(splats)))
-        drawn = add_splats(cloud.name, cloud, collection, read_constants(folder / "splats.ply"))
+        drawn = add_splats(cloud.name, cloud, collection, {} if theirs else read_constants(file), theirs)
         drawn[run_parts.KEY] = "splats"
         mesh = add_mesh(folder / "mesh.glb", f"{name} mesh", collection) if (folder / "mesh.glb").exists() else []
         run = Run(collection, add_root(f"RefGS {name}", drawn, mesh), drawn, left_out, mesh)

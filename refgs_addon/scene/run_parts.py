@@ -9,6 +9,7 @@ CAMERAS = "refgs_cameras"  # custom property of the collection of a run's camera
 ROOT = "refgs_root"  # custom property of the Empty that moves a run: the run's longest side, in the Empty's coordinates
 INSIDE = "RefGS Inside"  # modifier that draws a mesh in, under the splats
 FOLDER = "refgs_folder"  # custom property of a run's collection: its run folder
+THEIRS = "refgs_theirs"  # custom property of a run's collection: another program made its splats
 DOUBT = "refgs_doubt"  # custom property of a run's collection: the trainer's words on where photos do not tell
 
 

@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..nodes.splat_material import splat_material, values_material
 from ..nodes.splats_tree import NAME, splats_tree
 from ..ply_file import read_header, read_rows
+from ..spz_file import SUFFIX, read_spz_rows
 from .color_spaces import from_rec709
 
 MATERIALS = "albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"
@@ -36,17 +37,18 @@ def add_splats(
     cloud: bpy.types.PointCloud,
     collection: bpy.types.Collection,
     constants: dict[str, float] | None = None,
+    two_sided: bool = False,
 ) -> bpy.types.Object:
     """Add an object that draws the splats of a point cloud, with the modifier and the material for it. Returns the object.
 
     `cloud` comes from `point_cloud`. `constants` comes from `read_constants`: the values that all splats share. The material uses them in
-    place of attributes.
+    place of attributes. `two_sided` is for normals that may point to either side.
     """
     result = bpy.data.objects.new(name, cloud)
     collection.objects.link(result)
     # Under a lamp overlapping quads shadow each other in specks, and Eevee takes four times as long.
     result.visible_shadow = False
-    material = splat_material(name, constants or {})
+    material = splat_material(name, constants or {}, two_sided)
     cloud.materials.append(material)
     modifier = result.modifiers.new(NAME, "NODES")
     modifier.node_group = splats_tree(values_material())
@@ -88,7 +90,7 @@ def point_cloud(name: str, values: dict[str, np.ndarray]) -> bpy.types.PointClou
 
 
 def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
-    """Read the splats of a PLY file. Returns their arrays by name, and the number of splats left out because a value is not finite.
+    """Read the splats of a PLY or SPZ file. Returns their arrays by name, and the number of splats left out because a value is not finite.
 
     The file is a run's splats.ply, or comes from a 3DGS, 2DGS or Ref-Gaussian program, with 3DGS's property names. The float32 arrays are:
     - position (N, 3);
@@ -102,7 +104,7 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
     Splats without materials become matte. Their base colour comes from f_dc, the constant spherical harmonic. Splats without normals get
     their shortest axis as normal. Raises InputError for any other file.
     """
-    all_rows = read_rows(path)
+    all_rows = read_spz_rows(path) if path.suffix.lower() == SUFFIX else read_rows(path)
     if "packed_position" in all_rows.dtype.names:
         raise InputError(f"{path} is a compressed PLY: make a plain one of it, with splat-transform or SuperSplat")
     rows = finite_rows(all_rows)
@@ -160,6 +162,13 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
     normal[none] = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     return splats, len(all_rows) - len(rows)
+
+
+def is_ours(path: Path) -> bool:
+    """Check whether a file of splats has materials and normals of RefGS. Raises InputError if it cannot be read."""
+    if path.suffix.lower() == SUFFIX:
+        return False
+    return any(line[:1] == ["property"] and line[-1] in MATERIALS[:4] for line in read_header(path)[0])
 
 
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:

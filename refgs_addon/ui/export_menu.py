@@ -12,7 +12,7 @@ from ..scene import training
 from ..scene.deleted_splats import count_deleted
 from ..scene.edit import edits, splats_of
 from ..scene.run_parts import FOLDER, active_run, folder_of, parts
-from .operators import ImportRun, OnRun, has_trainer
+from .operators import ImportRun, ImportSplats, OnRun, has_trainer
 
 
 class _Export(OnRun, ExportHelper):
@@ -30,7 +30,9 @@ class _Export(OnRun, ExportHelper):
         if not super().poll(context):
             return False
         folder = folder_of(active_run(context))
-        if folder is None:
+        if folder is None and FOLDER not in active_run(context):
+            problem = "Another program's splats are no run. The command refgs export --splats makes one of them"
+        elif folder is None:
             problem = "The run's folder was moved or deleted: press Find Run Folder in the panel Run"
         else:
             problem = cls.problem(active_run(context), folder)
@@ -233,6 +235,7 @@ CLASSES = (*FILES, ApplyEdits)
 
 def _import_menu(self, context: bpy.types.Context) -> None:
     self.layout.operator(ImportRun.bl_idname, text="RefGS Run (folder)")
+    self.layout.operator(ImportSplats.bl_idname, text="Splats for RefGS (.ply, .spz)")
 
 
 def _export_menu(self, context: bpy.types.Context) -> None:

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
-from bpy_extras.io_utils import ExportHelper
+from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 from .. import jobs
 from ..errors import InputError, missing_module
@@ -137,6 +137,17 @@ class ImportRun(ReportsErrors, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         import_run_folder(self, context, Path(bpy.path.abspath(self.directory)))
+
+
+class ImportSplats(ReportsErrors, ImportHelper, bpy.types.Operator):
+    bl_idname = "refgs.import_splats"
+    bl_label = "Import Splats"
+    bl_description = "Import Gaussian splats of another program, to light them: matte, with the shortest axis as normal"
+
+    filter_glob: StringProperty(default="*.ply;*.spz", options={"HIDDEN"})
+
+    def work(self, context: bpy.types.Context) -> None:
+        import_run_folder(self, context, Path(bpy.path.abspath(self.filepath)))
 
 
 class FindRun(OnRunFolder, bpy.types.Operator):
@@ -370,5 +381,17 @@ class ContactSheet(_Render, bpy.types.Operator):
             render_in_background(context.scene, png, lights, self.size, self.samples)
 
 
-CLASSES = (ImportRun, FindRun, ShowPart, SetDetail, Crop, DeleteSplats, RestoreSplats, NextCamera, Photo, Turntable)
+CLASSES = (
+    ImportRun,
+    ImportSplats,
+    FindRun,
+    ShowPart,
+    SetDetail,
+    Crop,
+    DeleteSplats,
+    RestoreSplats,
+    NextCamera,
+    Photo,
+    Turntable,
+)
 CLASSES += (RenderPreview, ContactSheet, MarkAsset)

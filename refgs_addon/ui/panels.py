@@ -9,7 +9,7 @@ from ..nodes.splats_tree import NAME as MODIFIER
 from ..scene.camera_objects import photo_shown
 from ..scene.deleted_splats import points_of
 from ..scene.detail import LEVELS, detail
-from ..scene.run_parts import FOLDER, cameras, folder_of, parts, root, shown
+from ..scene.run_parts import FOLDER, THEIRS, cameras, folder_of, parts, root, shown
 from . import operators
 from .export_menu import ApplyEdits
 from .icons import thumbnail
@@ -36,12 +36,15 @@ class RunPanel(Tab, bpy.types.Panel):
     def _run(self, layout: bpy.types.UILayout, collection: bpy.types.Collection, found: dict) -> None:
         row = layout.row()
         row.label(text=collection.name, icon="POINTCLOUD_DATA")
-        lost = folder_of(collection) is None
-        if lost:
-            layout.label(text="Its folder was moved or deleted", icon="ERROR")
-        where = layout if lost else row
-        button = where.operator(operators.FindRun.bl_idname, text=None if lost else "", icon="FILE_FOLDER", emboss=lost)
-        button.folder = bpy.path.abspath(collection.get(FOLDER, ""))
+        if FOLDER in collection:
+            lost = folder_of(collection) is None
+            if lost:
+                layout.label(text="Its folder was moved or deleted", icon="ERROR")
+            where, text = (layout, None) if lost else (row, "")
+            button = where.operator(operators.FindRun.bl_idname, text=text, icon="FILE_FOLDER", emboss=lost)
+            button.folder = bpy.path.abspath(collection[FOLDER])
+        if THEIRS in collection:
+            layout.label(text="Normals are guessed: shortest axes", icon="INFO")
         row = layout.row(align=True)
         for part in found:
             button = row.operator(operators.ShowPart.bl_idname, text=part.title(), depress=part == shown(collection))

@@ -230,7 +230,7 @@ def test_edits_of_what_has_no_materials_cannot_be_written(scene, tmp_path):
     (tmp_path / "other").mkdir()
     write_ply(tmp_path / "other" / "splats.ply", foreign_columns(3, True))
     run = import_run(tmp_path / "other", scene)
-    with pytest.raises(InputError, match=r"has no materials to edit: add them .* --splats"):
+    with pytest.raises(InputError, match=r"has no materials to edit: give its splats .* --splats"):
         export_splats(run.collection, tmp_path / "edited.ply")
     assert not (tmp_path / "edited.ply").exists()
 
