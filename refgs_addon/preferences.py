@@ -239,11 +239,17 @@ def _draw_installation(box: bpy.types.UILayout, width: int) -> None:
         row.operator("refgs.remove_trainer", text="Remove", icon="TRASH")
 
 
+def letters(context: bpy.types.Context) -> int:
+    """Return how many letters fit into a line of the sidebar that is drawn."""
+    return int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6
+
+
 def wrapped_text(layout: bpy.types.UILayout, text: str, width: int, icon: str = "NONE") -> None:
     """Draw a text on lines of at most `width` letters."""
     column = layout.column(align=True)
     column.scale_y = 0.8
-    for line in textwrap.wrap(text, max(width, 20), break_long_words=False, break_on_hyphens=False):
+    width = max(width - (0 if icon == "NONE" else 3), 20)
+    for line in textwrap.wrap(text, width, break_on_hyphens=False):
         column.label(text=line, icon=icon)
         icon = "NONE" if icon == "NONE" else "BLANK1"
 

@@ -106,7 +106,11 @@ class Training(bpy.types.PropertyGroup):
                 "Find out from the photos, and show the answer during training. Paper assumes that it stands still",
             ),
             ("world", "Stands Still", "You walked around the object"),
-            ("camera", "Turns with the Camera", "The object stood on a turntable, or the lamp was fixed to the camera"),
+            (
+                "camera",
+                "Turns",
+                "It turns with the camera: the object stood on a turntable, or the lamp was fixed to the camera",
+            ),
         ],
     )
     exposures: EnumProperty(

@@ -9,6 +9,7 @@ from mathutils import Vector
 
 from .. import jobs
 from ..errors import InputError, missing_module
+from ..preferences import wrapped_text
 from ..scene import training
 from ..scene.questions import questions
 from ..scene.run_parts import active_run
@@ -17,6 +18,8 @@ from .operators import OnRun, has_trainer
 
 if TYPE_CHECKING:
     import numpy as np
+
+WIDTH = 400  # pixels of the dialogue
 
 
 class Hint(OnRun, bpy.types.Operator):
@@ -93,11 +96,11 @@ class Hint(OnRun, bpy.types.Operator):
         self._words = confirmation(plan, self.kind, float(part.mean()), context.scene.refgs.mesh)
         highlight.show(surface.corners(part))
         title = f"Train Again with This Part as {self.kind.capitalize()}?"
-        return context.window_manager.invoke_props_dialog(self, width=400, title=title, confirm_text="Train")
+        return context.window_manager.invoke_props_dialog(self, width=WIDTH, title=title, confirm_text="Train")
 
     def draw(self, context: bpy.types.Context) -> None:
         for words in self._words:
-            self.layout.label(text=words)
+            wrapped_text(self.layout, words, WIDTH // 7)
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if event.type in ("RIGHTMOUSE", "ESC"):

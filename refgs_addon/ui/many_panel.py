@@ -12,7 +12,7 @@ from bpy.props import IntProperty
 
 from .. import jobs
 from ..job_timers import follow_batch
-from ..preferences import wrapped_text
+from ..preferences import letters, wrapped_text
 from ..scene import asset_library, batch_table, many
 from .closing import KeepTraining, StopRun
 from .icons import thumbnail
@@ -108,7 +108,7 @@ class ManyPanel(Tab, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = self.layout, context.scene.refgs.many
-        width = int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6  # letters
+        width = letters(context)
         column = layout.column()
         column.use_property_split, column.use_property_decorate = True, False
         for name in ("captures", "results", "preset"):

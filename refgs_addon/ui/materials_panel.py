@@ -9,7 +9,7 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 from .. import compat
 from ..errors import InputError
 from ..nodes.edit_tree import REGIONS
-from ..preferences import wrapped_text
+from ..preferences import letters, wrapped_text
 from ..scene.doubt import doubt_shown, doubt_words, has_doubt, show_doubt
 from ..scene.edit import add_edit, edits, remove_edit
 from ..scene.material_presets import PRESETS, ROOT, materials, remove_material, save_material, set_material
@@ -186,13 +186,13 @@ class MaterialPanel(Tab, bpy.types.Panel):
                 layout.operator(ApplyEdits.bl_idname, icon="CHECKMARK")
 
         row = layout.row(align=True)
-        metal = row.operator(Hint.bl_idname, text="This Part Is Metal", icon="SHADING_RENDERED")
-        paint = row.operator(Hint.bl_idname, text="This Part Is Paint", icon="SHADING_SOLID")
+        metal = row.operator(Hint.bl_idname, text="This Part Is Metal")
+        paint = row.operator(Hint.bl_idname, text="This Part Is Paint")
         metal.kind, paint.kind = KINDS
         metal.question = paint.question = 0
 
     def _doubt(self, layout: bpy.types.UILayout, run: bpy.types.Collection, context: bpy.types.Context) -> None:
-        width = int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6  # letters
+        width = letters(context)
         if words := doubt_words(run):
             wrapped_text(layout, words[0].upper() + words[1:], width, "QUESTION")
         on = doubt_shown(run)

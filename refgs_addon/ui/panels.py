@@ -6,6 +6,7 @@ import bpy
 
 from .. import compat, jobs
 from ..nodes.splats_tree import NAME as MODIFIER
+from ..preferences import letters, wrapped_text
 from ..scene.camera_objects import photo_shown
 from ..scene.deleted_splats import points_of
 from ..scene.detail import LEVELS, detail
@@ -110,9 +111,9 @@ class PreviewPanel(Tab, bpy.types.Panel):
         layout.operator(operators.MarkAsset.bl_idname, icon="ASSET_MANAGER")
         for job in jobs.JOBS:
             if job.kind == "render":
-                self._render(layout.box(), job)
+                self._render(layout.box(), job, letters(context))
 
-    def _render(self, box: bpy.types.UILayout, job: jobs.Job) -> None:
+    def _render(self, box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
         row = box.row()
         row.label(text=job.name, icon={"done": "CHECKMARK", "failed": "ERROR"}.get(job.state, "SORTTIME"))
         row.operator("refgs.put_away", text="", icon="X", emboss=False).serial = job.serial
@@ -121,7 +122,7 @@ class PreviewPanel(Tab, bpy.types.Panel):
             box.template_icon(icon_value=thumbnail(Path(png)), scale=10)
             box.operator("wm.path_open", text="Open", icon="IMAGE_DATA").filepath = png
         elif job.state == "failed":
-            box.label(text=job.line)
+            wrapped_text(box, job.line[0].upper() + job.line[1:], width)
             box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
         else:
             box.progress(factor=job.fraction, text=job.line)

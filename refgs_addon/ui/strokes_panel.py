@@ -3,6 +3,7 @@
 import bpy
 
 from .. import jobs
+from ..preferences import letters
 from ..scene.strokes import STROKES
 from .photo_buttons import PAINTS, ChooseBrush, SaveStrokes
 from .train_panel import draw_job
@@ -21,7 +22,7 @@ class StrokesPanel(bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        width = int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6  # letters
+        width = letters(context)
         column = layout.column(align=True)
         for paints, icon in (("object", "MESH_CIRCLE"), ("rest", "SHADING_SOLID"), ("nothing", "X")):
             column.operator(ChooseBrush.bl_idname, text=PAINTS[paints][0], icon=icon).paints = paints

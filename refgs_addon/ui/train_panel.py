@@ -8,7 +8,7 @@ from bpy.props import StringProperty
 
 from .. import jobs, preferences
 from ..job_timers import follow_other_processes
-from ..preferences import wrapped_text
+from ..preferences import letters, wrapped_text
 from ..scene import live_splats, training
 from ..scene.regions import add_training_region, training_region
 from ..scene.strokes import canvases, masks_root
@@ -140,7 +140,7 @@ class TrainPanel(Tab, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = self.layout, context.scene.refgs
-        width = int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6  # letters
+        width = letters(context)
         if not preferences.set_up():
             wrapped_text(layout.box(), preferences.status()[1], width, "INFO")
             layout.operator(
@@ -180,7 +180,8 @@ class TrainPanel(Tab, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator(CheckCapture.bl_idname, icon="VIEWZOOM")
         row.operator(Train.bl_idname, icon="PLAY")
-        for job in jobs.JOBS:
+        # What runs comes first, then what ended last: a report must not push a training out of sight.
+        for job in sorted(reversed(jobs.JOBS), key=lambda job: (job.ended, 0 if job.ended else job.serial)):
             if job.program == jobs.TRAINER and job.kind != "batch" and job not in preferences.own_jobs():
                 draw_job(layout.box(), context.scene, job, width)
         for known in settings.runs:
@@ -322,9 +323,9 @@ def _draw_run(box: bpy.types.UILayout, scene: bpy.types.Scene, folder: Path, wid
     elif state == "stopped":
         row.operator(Resume.bl_idname, text=f"Resume {folder.name}", icon="PLAY").folder = str(folder)
     elif state == "training":
-        row.label(text=f"{folder.name} is being trained", icon="SORTTIME")
+        wrapped_text(row, f"{folder.name} is being trained", width - 6, "SORTTIME")
     else:
-        row.label(text=f"{folder.name} does not exist", icon="GHOST_DISABLED")
+        wrapped_text(row, f"{folder.name} does not exist", width - 6, "GHOST_DISABLED")
         row.operator(FindRun.bl_idname, text="", icon="FILE_FOLDER").folder = str(folder)
     row.operator(RemoveFromList.bl_idname, text="", icon="X").folder = str(folder)
     if state == "training":
