@@ -213,11 +213,13 @@ def check_room(folder: Path) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise InputError if a capture's folder is missing or a file, or its path is not Unicode."""
+    """Raise InputError if a capture's folder is missing, a file or a run folder, or its path is not Unicode."""
     if folder.is_file():
         raise InputError(f"{folder}: this is a file. Name the folder that holds it; refgs frames makes one of a film.")
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder. Name the folder that holds the capture.")
+    if (folder / "run.toml").is_file():  # its textures would be taken for photos
+        raise InputError(f"{folder} is a run, not a capture: name the folder of the photos that it was trained on.")
     check_unicode(folder)
 
 

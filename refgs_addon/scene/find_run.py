@@ -24,7 +24,7 @@ def find_run(old: Path, folder: Path) -> None:
     """
     folder = Path(os.path.abspath(folder))
     if not jobs.run_state(folder):
-        raise InputError(f"{folder} contains no run: choose the folder that the training wrote")
+        raise InputError(f"{folder} is not a run: choose the folder that the training wrote")
     for collection in bpy.data.collections:
         if FOLDER in collection and Path(bpy.path.abspath(collection[FOLDER])) == old:
             _check_splats(collection, folder)

@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 from mathutils import Matrix
 
+from .. import jobs
 from ..errors import InputError
 from ..json_file import read_json
 from ..nodes import principled
@@ -61,7 +62,11 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     folder = Path(folder)
     alone = folder.suffix.lower() in THEIRS and folder.is_file()
     if not alone and not folder.is_dir():
-        raise InputError(f"{folder} is not a folder: choose the folder that a RefGS run wrote")
+        raise InputError(f"{folder} is not a folder: choose the folder that a training wrote")
+    if not alone and not os.path.lexists(folder / "splats.ply"):
+        if jobs.run_state(folder):
+            raise InputError(f"the training of {folder} has not ended: wait for it, or resume it")
+        raise InputError(f"{folder} is not a run: it has no splats.ply. Choose the folder that a training wrote")
     folder = Path(
         os.path.abspath(folder)
     )  # not resolved: by a link's target, a copied project would find the original's run

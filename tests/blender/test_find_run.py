@@ -92,7 +92,7 @@ def test_another_run_is_not_taken_for_it(edited, addon, tmp_path):
     for name, spoil, says in (
         ("other", lambda path: write_ply(path, random_columns(seed=1)), "is another run"),
         ("fewer", lambda path: write_ply(path, random_columns(3)), "is another run"),
-        ("none", lambda path: path.unlink(), "contains no run"),
+        ("none", lambda path: path.unlink(), "is not a run"),
     ):
         spoil(write_run(tmp_path / name) / "splats.ply")
         before = collection()[FOLDER]

@@ -478,7 +478,7 @@ def names_another_file(path):
 @pytest.mark.parametrize(
     ("name", "spoil", "says"),
     [
-        ("splats.ply", Path.unlink, "cannot read"),
+        ("splats.ply", Path.unlink, "is not a run"),
         ("splats.ply", cut, "truncated"),
         ("splats.ply", replacing(b"element vertex ", b"element vertex x"), "broken header"),
         ("splats.ply", replacing(b"property float y", b"property float x"), "broken header"),
@@ -510,6 +510,17 @@ def test_a_broken_folder_leaves_nothing_behind(run_folder, scene, name, spoil, s
     assert "\n" not in str(error.value) and name in str(error.value)
     assert set(bpy.data.user_map()) == before
     assert scene.world == own and not own.use_fake_user and scene.camera is None
+
+
+def test_what_is_no_run_is_named(run_folder, scene):
+    (run_folder / "splats.ply").unlink()
+    with pytest.raises(InputError, match=r"pot is not a run: it has no splats\.ply"):
+        import_run(run_folder, scene)
+    (run_folder / "run.toml").touch()
+    with pytest.raises(InputError, match=r"the training of .*pot has not ended"):
+        import_run(run_folder, scene)
+    with pytest.raises(InputError, match=r"splats.ply is not a folder"):
+        import_run(run_folder / "splats.ply", scene)
 
 
 def test_a_run_stands_beside_what_was_in_its_place(run_folder, addon):

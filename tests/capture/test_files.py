@@ -211,7 +211,7 @@ def test_masks_beside_photos_are_no_photos(tmp_path):
 def test_photos_in_other_folders_are_named(tmp_path):
     for camera in ("cam1", "cam2"):
         write(tmp_path / camera / "0001.png", np.zeros((8, 8, 3), np.uint8))
-    with pytest.raises(InputError, match="no capture here, but there are photos in 2 folders, first cam1"):
+    with pytest.raises(InputError, match="is not a capture, but there are photos in 2 folders, first cam1"):
         read_capture(tmp_path)
 
 

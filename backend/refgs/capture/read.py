@@ -120,14 +120,13 @@ def _check_layout(folder: Path) -> str:
     if inner := [path.name for path in files.folders(folder) if photos_in(files, path, deep=True)]:
         where = f"in {inner[0]}" if len(inner) == 1 else f"in {len(inner)} folders, first {inner[0]}"
         raise InputError(
-            f"{folder}: no capture here, but there are photos {where}. Name the one that is a capture; "
+            f"{folder} is not a capture, but there are photos {where}. Name the one that is a capture; "
             "if they are photos of one object, put their folders into a folder images."
         )
     raise InputError(
-        f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender, Stanford-ORB), transforms.json "
-        "(nerfstudio, instant-ngp), sparse/0 and the like (COLMAP), 0-camera.pkl (NeRO), train_000/metadata.json (TensoIR), and for "
-        "photos, here and in images. "
-        "Name the folder that holds them."
+        f"{folder} is not a capture: no photos are in it or in its folder images. Name the folder that holds them. "
+        "Cameras are read from transforms_train.json (NeRF-Blender, Stanford-ORB), transforms.json (nerfstudio, instant-ngp), "
+        "sparse/0 and the like (COLMAP), 0-camera.pkl (NeRO) and train_000/metadata.json (TensoIR)."
     )
 
 
