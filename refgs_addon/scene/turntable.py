@@ -11,10 +11,10 @@ from .run_parts import parts, root
 KEY = "refgs_turntable"  # custom property of the Empty that rotates
 
 
-def add_turntable(scene: bpy.types.Scene, collection: bpy.types.Collection, seconds: float = 4.0) -> bpy.types.Object:
-    """Make a run rotate once about itself in `seconds`, by parenting its objects to a rotating Empty. Returns the Empty.
+def add_turntable(scene: bpy.types.Scene, collection: bpy.types.Collection) -> bpy.types.Object:
+    """Make a run rotate once about itself in the scene's frame range, by parenting its objects to a rotating Empty. Returns the Empty.
 
-    The scene's frame range is set to that length. The full turn is reached one frame after the last frame, so that a loop does not pause.
+    The full turn is reached one frame after the last frame, so that a loop does not pause.
     Raises InputError if the run has a turntable already.
     """
     found = parts(collection)
@@ -34,16 +34,13 @@ def add_turntable(scene: bpy.types.Scene, collection: bpy.types.Collection, seco
     table.empty_display_size = 0.6 * max(b - a for a, b in zip(low, high, strict=True))
     table.location = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
     collection.objects.link(table)
-    frames = max(2, round(seconds * scene.render.fps / scene.render.fps_base))
-    scene.frame_start, scene.frame_end = 1, frames
-    for frame, turn in ((1, 0.0), (frames + 1, 2 * math.pi)):
+    for frame, turn in ((scene.frame_start, 0.0), (scene.frame_end + 1, 2 * math.pi)):
         table.rotation_euler = 0.0, 0.0, turn
         table.keyframe_insert("rotation_euler", index=2, frame=frame)
     for curve in compat.fcurves(table):
         for key in curve.keyframe_points:
             key.interpolation = "LINEAR"
         curve.extrapolation = "LINEAR"
-    scene.frame_set(1)
     table.rotation_euler = 0.0, 0.0, 0.0
     table.parent, table.matrix_parent_inverse = base, found["splats"][0].matrix_parent_inverse
     for item in items:

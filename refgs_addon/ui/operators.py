@@ -318,12 +318,12 @@ def view_through_camera(context: bpy.types.Context) -> None:
 class Turntable(OnRun, bpy.types.Operator):
     bl_idname = "refgs.turntable"
     bl_label = "Turntable"
-    bl_description = "Rotate the object once about itself; Render > Render Animation renders the film"
-
-    seconds: FloatProperty(name="Seconds", description="Duration of one turn", default=4.0, min=0.1, soft_max=20.0)
+    bl_description = (
+        "Rotate the object once about itself within the scene's frame range; Render > Render Animation renders the film"
+    )
 
     def work(self, context: bpy.types.Context) -> None:
-        add_turntable(context.scene, active_run(context), self.seconds)
+        add_turntable(context.scene, active_run(context))
 
 
 class MarkAsset(OnRun, bpy.types.Operator):
