@@ -18,7 +18,7 @@ def mark_asset(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None
     camera.
     """
     own = cameras(collection)
-    camera = scene.camera or next(iter(own.objects if own else ()), None)
+    camera = scene.camera or next((item for item in (own.objects if own else ()) if item.type == "CAMERA"), None)
     alone = scene.copy()  # with its world and how it traces rays
     try:
         for item in alone.collection.objects:

@@ -103,9 +103,16 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
             cameras[run_parts.CAMERAS] = cameras.hide_viewport = True  # a hundred cameras hide the object
             collection.children.link(cameras)
             run.cameras = {frame["name"]: add_camera(frame, cameras) for frame in frames}
+            # Blender draws a dashed line from each camera to its parent, unless that is hidden.
+            holder = bpy.data.objects.new(cameras.name, None)
+            holder.hide_viewport = True
+            holder.parent, holder.matrix_parent_inverse = run.root, Matrix.Translation(-run.root.location)
+            cameras.objects.link(holder)
+            for camera in run.cameras.values():
+                camera.parent = holder
             if scene.camera is None:
                 frame_camera(scene, next(iter(run.cameras.values())))
-        for item in (drawn, *mesh, *run.cameras.values()):
+        for item in (drawn, *mesh):
             item.parent, item.matrix_parent_inverse = run.root, Matrix.Translation(-run.root.location)
         for material in {material for item in (drawn, *mesh) for material in item.data.materials}:
             add_world_diffuse(material, _occlusion(material))
