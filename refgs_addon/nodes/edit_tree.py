@@ -22,7 +22,7 @@ from . import (
 )
 from .world_diffuse import surface_inputs
 
-NAME = "RefGS Edit"  # the tree; its modifiers' names begin with it
+NAME = "RefGS Edit"
 MESH_EDITS = "RefGS Follow"  # the mesh's tree and modifier
 FALLOFF = 0.2  # of a new edit: the width of its soft border, as a fraction of the region
 REGIONS = ("Everywhere", "Box", "Sphere", "Similar", "Painted")

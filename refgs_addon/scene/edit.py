@@ -28,6 +28,7 @@ def add_edit(
     `collection` is the collection of the run. `where` selects the splats, as in `nodes.edit_tree`: "Everywhere", "Box", "Sphere", "Similar"
     or "Painted". "Box", "Sphere" and "Similar" get an Empty, which the artist moves, rotates and scales.
     "Painted" gets an object with the shape of the mesh, on which the artist paints. `material` is the name of a material preset.
+    The edit is named after both, such as "Gold, box".
 
     Raises InputError if the collection has no splats, or if the preset is missing or invalid. "Painted" also needs a mesh.
     """
@@ -37,7 +38,7 @@ def add_edit(
     splats = splats_of(collection)
     if where == "Painted" and not parts(collection).get("mesh"):
         raise InputError(f"{collection.name} has no mesh to paint on: make the run's mesh, and import the run again")
-    edit = splats.modifiers.new(NAME, "NODES")
+    edit = splats.modifiers.new(f"{material}, {where.lower()}", "NODES")
     edit.node_group = edit_tree()
     splats.modifiers.move(len(splats.modifiers) - 1, splats.modifiers.find(SPLATS))
     edit = splats.modifiers[edit.name]

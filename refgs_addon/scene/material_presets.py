@@ -41,8 +41,14 @@ def read_material(name: str) -> dict[str, float | tuple[float, ...]]:
 
 
 def set_material(edit: bpy.types.NodesModifier, name: str) -> None:
-    """Apply a material preset to an edit. Raises InputError where it is missing or invalid."""
+    """Apply a material preset to an edit. Raises InputError where it is missing or invalid.
+
+    The edit's name changes with it, as long as it begins with a material's name as `edit.add_edit` gave it.
+    """
     set_inputs(edit, read_material(name))
+    before, comma, where = edit.name.partition(", ")
+    if comma and before in materials():
+        edit.name = f"{name}, {where}"
 
 
 def set_inputs(edit: bpy.types.NodesModifier, values: dict[str, float | tuple[float, ...]]) -> None:

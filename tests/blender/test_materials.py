@@ -45,6 +45,16 @@ def test_those_that_come_with_it(own):
         assert ("Base Color" in found) == (found["Color Amount"] == 1.0)
 
 
+def test_edits_are_named_after_material_and_place(run, own):
+    names = [add_edit(run.collection, where, "Chrome").name for where in ("Everywhere", "Box", "Box")]
+    assert names == ["Chrome, everywhere", "Chrome, box", "Chrome, box.001"]
+    first, second, _ = edits(run.splats)
+    set_material(first, "Clay")
+    second.name = "the lid"
+    set_material(second, "Clay")
+    assert [edit.name for edit in edits(run.splats)] == ["Clay, everywhere", "the lid", "Chrome, box.001"]
+
+
 def test_one_is_saved_used_and_removed(edit, own):
     compat.set_modifier_input(edit, "Base Color", (0.9, 0.5, 0.4, 1.0))
     compat.set_modifier_input(edit, "Roughness", 0.33)
@@ -99,6 +109,7 @@ def test_the_buttons(addon, edit, own):
     file = f"{folder}/Brushed_Steel.py"  # as Blender's list of presets passes it
     bpy.ops.refgs.set_material(**which, material=file)
     assert values(edit)["Roughness"] == pytest.approx(0.4)
+    which["edit"] = edit.name
     bpy.ops.refgs.keep_material(**which, name="Steel of mine")
     assert bpy.utils.preset_paths("refgs_material") == [str(own), folder]
     assert bpy.ops.refgs.add_edit(where="Everywhere", material="Steel of mine") == {"FINISHED"}
