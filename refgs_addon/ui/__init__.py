@@ -15,6 +15,7 @@ from . import (
     light_panel,
     many_panel,
     materials_panel,
+    menus,
     operators,
     panels,
     photo_buttons,
@@ -41,7 +42,7 @@ _MODULES = (
     highlight,
     hint_buttons,
 )
-_MODULES += (materials_panel, light_panel, export_menu, drop)
+_MODULES += (materials_panel, light_panel, export_menu, menus, drop)
 CLASSES = [cls for module in _MODULES for cls in getattr(module, "CLASSES", ())]
 
 
