@@ -54,7 +54,7 @@ class Job:
     program: str = TRAINER
     state: str = "waiting"
     line: str = ""  # current step; at the end, the error
-    fraction: float = 0.0  # of the current step, where a stage event has it
+    fraction: float = 0.0  # of the current step, where a stage event has it, or of the mesh after a training
     warnings: list[str] = field(default_factory=list)
     decided: dict[str, str] = field(default_factory=dict)  # result and reason of each automatic setting
     masked: Callable[[dict], None] | None = None  # called with the event that tells that a training has made masks
@@ -176,7 +176,7 @@ class Job:
                 if self.masked is not None:
                     self.masked(event)
             case "progress" if self.curve and "stage" in event:  # of the mesh: keep the training's figures
-                self.line = ""
+                self.line, self.fraction = "", event["done"] / event["total"]
             case "progress":
                 self.progress, self.line = event, ""
                 if "stage" not in event:  # of a training

@@ -209,6 +209,8 @@ def test_a_mesh_is_made_after_an_export_that_was_killed(talk, ball_capture, tmp_
     for _ in range(2):
         talk.tell("export", run=str(run), texture=64)
     assert talk.until("done")["mesh"] == str(run / "mesh.glb")
+    parts = [event["done"] / event["total"] for event in talk.heard if event.get("stage") == "mesh"]
+    assert parts[0] == 0 and parts[-1] == 0.91 and sorted(parts) == parts and len(set(parts)) > 5
     assert "mesh.glb exists" in talk.until("failed")["what"]
 
 

@@ -273,6 +273,8 @@ def draw_status(self, context: bpy.types.Context) -> None:
 def fraction(job: jobs.Job) -> float:
     """Return how much of a job, or of its present stage, is done, 0..1."""
     facts = job.progress
+    if "train" in job.results:  # the mesh is being made
+        return job.fraction
     return facts["done" if "stage" in facts else "iteration"] / max(facts["total"], 1) if facts else 0.0
 
 
@@ -281,7 +283,7 @@ def status_words(job: jobs.Job) -> str:
     if job.state == "paused":
         return "paused"
     if "train" in job.results:
-        return "making the mesh"
+        return f"making the mesh, {job.fraction:.0%}"
     if not job.progress:
         return "waiting" if job.state == "waiting" else "starting"
     if "stage" in job.progress:
@@ -293,7 +295,9 @@ def status_words(job: jobs.Job) -> str:
             return "{done} frames read, {kept} kept, {blurred} blurred".format(**job.progress)
         if stage in ("points", "looking", "reading", "carving", "edges"):
             return f"making masks: {stage}"
-        return {"colours": "learning colours", "baking": "baking textures"}.get(stage, f"finding cameras: {stage}")
+        if stage == "mesh":
+            return f"making the mesh, {fraction(job):.0%}"
+        return "learning colours" if stage == "colours" else f"finding cameras: {stage}"
     return f"{_duration(job.progress['seconds_left'])} left"
 
 

@@ -194,6 +194,7 @@ def test_what_fails_is_said_and_what_was_done_before_it_stays(start):
     job = start(mesh=True)
     assert final_state(job) == "failed" and job.line == "the mesh is crumbs" and "train" in job.results
     assert job.progress["psnr"] == 30  # the mesh's progress does not replace it in the panel
+    assert job.fraction == 0.4
 
 
 def test_a_trainer_that_dies(start):

@@ -262,6 +262,12 @@ def test_photos_without_cameras(addon, tmp_path):
     assert final_state(jobs.JOBS[-1]) == "done" and "check" in jobs.JOBS[-1].results
 
 
+def test_the_bar_shows_how_much_of_the_mesh_is_made(addon, capture, run_folder):
+    for job in (training.train(addon), jobs.export(preferences.python(), run_folder, run_folder / "log")):
+        assert final_state(job) == "failed"  # as the fake does, after 40 % of the mesh
+        assert (train_panel.fraction(job), train_panel.status_words(job)) == (0.4, "making the mesh, 40%")
+
+
 def test_display_splats_are_made_by_the_trainer(addon, run_folder, tmp_path):
     bpy.ops.refgs.import_run(directory=f"{run_folder}/")
     (tmp_path / "a.ply").write_text("of before")

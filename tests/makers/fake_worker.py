@@ -185,7 +185,7 @@ def main():
                 say("done", job="export", display_splats=file)
             else:
                 (Path(command["run"]) / "mesh asked for").touch()
-                say("progress", stage="baking", done=10, total=600)
+                say("progress", stage="mesh", done=40, total=100)
                 say("failed", job=command["command"], what="the mesh is crumbs", fault=False)
         time.sleep(0.002)
 
