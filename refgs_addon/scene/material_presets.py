@@ -82,12 +82,17 @@ def save_material(edit: bpy.types.NodesModifier, name: str) -> Path:
 def remove_material(name: str) -> None:
     """Remove a preset that the artist saved. Raises InputError for any other preset."""
     file = materials().get(name)
-    if file is None or file.parent != _user_folder():
+    if file is None or not is_own(file):
         raise InputError(f"{name} is not a material that you saved: only those can be removed")
     try:
         file.unlink()
     except OSError as error:
         raise InputError(f"cannot remove {file}: {error.strerror}") from None
+
+
+def is_own(file: Path) -> bool:
+    """Check whether the artist saved a preset."""
+    return file.parent == _user_folder()
 
 
 def _user_folder() -> Path:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 CURVE = 200, 130  # pixels
+BALL = 32  # pixels, Blender's size of icons
 EDGE, DOT = 4, 3  # pixels: margin, and half a dot's side
 GROUND, GRID, LINE, DOTS = (0.0, 0.0, 0.0, 0.25), (1.0, 1.0, 1.0, 0.12), (0.35, 0.65, 1.0, 1.0), (1.0, 0.65, 0.25, 1.0)
 
@@ -102,6 +103,45 @@ def plot(trained: list[tuple[float, float]], held_out: list[tuple[float, float]]
         row, column = place(y, 1), place(x, 0)
         pixels[row - DOT : row + DOT + 1, column - DOT : column + DOT + 1] = DOTS
     return pixels
+
+
+def swatch(file: Path, values: dict) -> int:
+    """Return the number of an icon with a ball of a material preset, 0 if Blender has no window or no numpy.
+
+    `values` are those of the preset in `file`, as `material_presets.read_material` returns them.
+    """
+    if _pictures is None:
+        return 0
+    key = f"{file} {values}"
+    if key not in _pictures:
+        color = values.get("Base Color", (0.5, 0.5, 0.5))[:3]
+        try:
+            pixels = ball(color, values.get("Metallic", 0.0), values.get("Roughness", 0.5))
+        except ModuleNotFoundError:
+            return 0
+        shown = _pictures.new(key)
+        shown.icon_size = BALL, BALL
+        shown.icon_pixels_float = pixels.ravel().tolist()
+    return _pictures[key].icon_id
+
+
+def ball(color: tuple[float, ...], metallic: float, roughness: float) -> "np.ndarray":
+    """Draw a ball of a material, lit from the upper left. Returns sRGB pixels, premultiplied with alpha (BALL, BALL, 4), bottom row first.
+
+    `color` is linear Rec.709. A metal has a darker rim, and highlights in its colour.
+    """
+    import numpy as np
+
+    y, x = np.mgrid[-1 : 1 : BALL * 1j, -1 : 1 : BALL * 1j]
+    z = np.sqrt((1 - x**2 - y**2).clip(0))
+    base, normal = np.array(color), np.stack([x, y, z], axis=-1)
+    light, half = np.array([-0.5, 0.6, 0.62]), np.array([-0.28, 0.34, 0.9])
+    diffuse = (0.2 + 0.8 * (normal @ light).clip(0)) * (1 - 0.7 * metallic * (1 - z))
+    shine = (normal @ half).clip(0) ** (2 / max(roughness, 0.2) ** 4)  # Blinn's exponent for a GGX roughness
+    tint = metallic * base + (1 - metallic) * 0.5
+    linear = (base * diffuse[..., None] + tint * ((1 - 0.7 * roughness) * shine)[..., None]).clip(0, 1)
+    inside = x**2 + y**2 <= 1
+    return np.dstack([linear ** (1 / 2.2) * inside[..., None], inside]).astype(np.float32)
 
 
 def _forget(job: jobs.Job) -> None:

@@ -1,5 +1,6 @@
 """Draw the Materials panel, in which the artist changes the materials of a run's splats."""
 
+from pathlib import Path
 from typing import ClassVar
 
 import bpy
@@ -12,12 +13,20 @@ from ..nodes.edit_tree import REGIONS
 from ..preferences import letters, wrapped_text
 from ..scene.doubt import doubt_shown, doubt_words, has_doubt, show_doubt
 from ..scene.edit import add_edit, edits, remove_edit
-from ..scene.material_presets import PRESETS, ROOT, materials, remove_material, save_material, set_material
+from ..scene.material_presets import (
+    ROOT,
+    is_own,
+    materials,
+    read_material,
+    remove_material,
+    save_material,
+    set_material,
+)
 from ..scene.questions import KINDS, questions
 from ..scene.run_parts import active_run, parts
 from .export_menu import ApplyEdits
 from .hint_buttons import Hint
-from .icons import thumbnail
+from .icons import swatch, thumbnail
 from .operators import OnRun, ReportsErrors, select_only, show_materials
 from .panels import Tab
 
@@ -116,10 +125,10 @@ class SetMaterial(_OfEdit, bpy.types.Operator):
     bl_label = "Set Material"
     bl_description = "Set this edit to the values of a material"
 
-    material: StringProperty(name="Material", description="Name or file of the preset", options={"HIDDEN"})
+    material: StringProperty(name="Material", description="Name of the preset", options={"HIDDEN"})
 
     def work(self, context: bpy.types.Context) -> None:
-        set_material(self.modifier(), bpy.path.display_name(self.material, title_case=False))
+        set_material(self.modifier(), self.material)
 
 
 class KeepMaterial(_OfEdit, bpy.types.Operator):
@@ -154,19 +163,31 @@ class MaterialPresets(PresetPanel, bpy.types.Panel):
     bl_label = "Materials"
 
     def draw(self, context: bpy.types.Context) -> None:
-        edit = context.refgs_edit
-        which = {"splats": edit.id_data.name, "edit": edit.name}
-        self.layout.emboss, self.layout.operator_context = "PULLDOWN_MENU", "EXEC_DEFAULT"
-        self.path_menu(
-            bpy.utils.preset_paths(PRESETS),
-            SetMaterial.bl_idname,
-            props_default=which,
-            prop_filepath="material",
-            filter_ext=lambda ending: ending == ".py",
-            display_name=lambda file: bpy.path.display_name(file, title_case=False),
-            add_operator=KeepMaterial.bl_idname,
-            add_operator_props=which,
-        )
+        layout, edit, manager = self.layout, context.refgs_edit, context.window_manager
+        layout.emboss, layout.operator_context = "PULLDOWN_MENU", "EXEC_DEFAULT"
+        column = layout.column(align=True)
+        for name, file in materials().items():
+            row = column.row(align=True)
+            button = row.operator(SetMaterial.bl_idname, text=name, icon_value=_swatch(name, file), translate=False)
+            button.splats, button.edit, button.material = edit.id_data.name, edit.name, name
+            if is_own(file):
+                button = row.operator(KeepMaterial.bl_idname, text="", icon="REMOVE")
+                button.name, button.remove_name = name, True
+        layout.separator()
+        row = layout.row()
+        field = row.row()
+        field.emboss = "NORMAL"
+        field.prop(manager, "preset_name", text="")
+        button = row.operator(KeepMaterial.bl_idname, text="", icon="ADD")
+        button.splats, button.edit, button.name = edit.id_data.name, edit.name, manager.preset_name
+
+
+def _swatch(name: str, file: Path) -> int:
+    """Return the number of a preset's icon, 0 if the preset cannot be read."""
+    try:
+        return swatch(file, read_material(name))
+    except InputError:
+        return 0
 
 
 class MaterialPanel(Tab, bpy.types.Panel):

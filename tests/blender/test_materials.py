@@ -1,6 +1,10 @@
 """Test the list of material presets: those of the add-on, and those that the user saved."""
 
+from types import SimpleNamespace
+from unittest.mock import Mock
+
 import bpy
+import numpy as np
 import pytest
 
 from refgs_addon import compat, ui
@@ -14,6 +18,8 @@ from refgs_addon.scene.material_presets import (
     save_material,
     set_material,
 )
+from refgs_addon.ui.icons import BALL, ball
+from refgs_addon.ui.materials_panel import MaterialPresets
 
 OURS = ["Brushed Steel", "Chrome", "Clay", "Copper", "Glazed Ceramic", "Gold", "Polished", "Rubber", "Silver"]
 
@@ -43,6 +49,33 @@ def test_those_that_come_with_it(own):
         found = read_material(name)
         assert {"Color Amount", "Metallic", "Metallic Amount", "Roughness", "Roughness Amount"} <= found.keys()
         assert ("Base Color" in found) == (found["Color Amount"] == 1.0)
+
+
+def test_each_preset_has_a_ball_of_its_color(own):
+    for values in map(read_material, OURS):
+        color = values.get("Base Color", (0.5,) * 4)[:3]
+        pixels = ball(color, values["Metallic"], values["Roughness"])
+        assert pixels.shape == (BALL, BALL, 4) and np.isfinite(pixels).all()
+        inside = pixels[pixels[..., 3] == 1][:, :3] ** 2.2
+        assert 0.7 < (pixels[..., 3] == 1).mean() < 0.8
+        if max(color) - min(color) > 0.2:
+            assert [*np.argsort(inside.mean(axis=0))] == [*np.argsort(color)]
+
+
+def test_the_list_removes_only_what_was_saved(addon, edit, own):
+    save_material(edit, "Mine")
+    drawn = []
+
+    def operator(name, **look):
+        drawn.append(SimpleNamespace(which=name, **look))
+        return drawn[-1]
+
+    layout = Mock(operator=operator)
+    layout.column.return_value = layout.row.return_value = layout
+    context = Mock(refgs_edit=edit, window_manager=bpy.context.window_manager)
+    MaterialPresets.draw(SimpleNamespace(layout=layout), context)
+    assert [button.material for button in drawn if button.which == "refgs.set_material"] == sorted([*OURS, "Mine"])
+    assert [button.name for button in drawn if getattr(button, "remove_name", False)] == ["Mine"]
 
 
 def test_edits_are_named_after_material_and_place(run, own):
@@ -106,8 +139,7 @@ def test_it_can_be_undone(addon, edit):
 def test_the_buttons(addon, edit, own):
     (folder,) = bpy.utils.preset_paths("refgs_material")
     which = {"splats": edit.id_data.name, "edit": edit.name}
-    file = f"{folder}/Brushed_Steel.py"  # as Blender's list of presets passes it
-    bpy.ops.refgs.set_material(**which, material=file)
+    bpy.ops.refgs.set_material(**which, material="Brushed Steel")
     assert values(edit)["Roughness"] == pytest.approx(0.4)
     which["edit"] = edit.name
     bpy.ops.refgs.keep_material(**which, name="Steel of mine")
