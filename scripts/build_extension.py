@@ -87,6 +87,7 @@ def stage(folder: Path, wheels: Path) -> None:
     The manifest lists the platforms and the wheels of uv, which Blender then installs.
     """
     shutil.copytree(ROOT / "refgs_addon", folder / "refgs_addon", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "docs", folder / "docs")
     for name in ("__init__.py", "LICENSE"):
         shutil.copy(ROOT / name, folder)
     shutil.copytree(wheels, folder / "wheels")

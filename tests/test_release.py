@@ -50,6 +50,7 @@ def test_locks_hold_what_the_trainer_needs_and_no_address(archives):
 
 def test_the_zips(archives):
     code = {str(path.relative_to(ROOT)) for path in (ROOT / "refgs_addon").rglob("*.py")}
+    code |= {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
     assert set(archives) == set(NAMES.values())
     for archive in archives.values():
         names = set(zipfile.ZipFile(archive).namelist())

@@ -102,6 +102,7 @@ class Menu(bpy.types.Menu):
     def draw(self, context: bpy.types.Context) -> None:
         for menu in (TrainMenu, RunMenu, MaterialsMenu, LightMenu, PreviewMenu):
             self.layout.menu(menu.bl_idname)
+        self.layout.operator(operators.OpenManual.bl_idname)
 
 
 def _object_menu(self, context: bpy.types.Context) -> None:

@@ -24,6 +24,8 @@ from ..scene.run_toml import capture_of, newer_release, up_was_chosen
 from ..scene.turntable import add_turntable
 from ..scene.world_light import hdris
 
+MANUAL = Path(__file__).resolve().parents[2] / "docs" / "blender.md"
+
 
 class ReportsErrors:
     """Call the operator's method `work`, and show an InputError as one line."""
@@ -148,6 +150,20 @@ class ImportSplats(ReportsErrors, ImportHelper, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         import_run_folder(self, context, Path(bpy.path.abspath(self.filepath)))
+
+
+class OpenManual(ReportsErrors, bpy.types.Operator):
+    bl_idname = "refgs.open_manual"
+    bl_label = "Open Manual"
+    bl_description = (
+        "Open the manual's page on Blender, a text file that came with the add-on. Its folder has the other pages"
+    )
+    bl_options: ClassVar = {"REGISTER"}
+
+    def work(self, context: bpy.types.Context) -> None:
+        if not MANUAL.is_file():
+            raise InputError(f"{MANUAL} does not exist: install the add-on again")
+        bpy.ops.wm.path_open(filepath=str(MANUAL))
 
 
 class FindRun(OnRunFolder, bpy.types.Operator):
@@ -384,6 +400,7 @@ class ContactSheet(_Render, bpy.types.Operator):
 CLASSES = (
     ImportRun,
     ImportSplats,
+    OpenManual,
     FindRun,
     ShowPart,
     SetDetail,

@@ -16,7 +16,7 @@ from .checked_capture import draw_capture
 from .closing import KeepTraining, StopRun
 from .decisions_box import draw_decisions
 from .icons import curve_icon, preview_icon
-from .operators import FindRun, OnCapture, OnJob, OnRunFolder, ReportsErrors, import_run_folder, select_only
+from .operators import FindRun, OnCapture, OnJob, OnRunFolder, OpenManual, ReportsErrors, import_run_folder, select_only
 from .panels import Tab
 from .photo_buttons import MakeMasks, PaintStrokes, PhotosFromVideo, SaveStrokes
 
@@ -137,6 +137,9 @@ class TrainPanel(Tab, bpy.types.Panel):
     bl_idname = "REFGS_PT_train"
     bl_label = "Train"
     bl_order = 0
+
+    def draw_header_preset(self, context: bpy.types.Context) -> None:
+        self.layout.operator(OpenManual.bl_idname, text="", icon="HELP", emboss=False)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = self.layout, context.scene.refgs

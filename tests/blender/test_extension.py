@@ -5,12 +5,14 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
 
 from refgs_addon import ui
+from refgs_addon.ui import operators
 from tests.makers.runs import COUNT, write_panorama
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -19,7 +21,7 @@ TOOL = Path(bpy.utils.resource_path("LOCAL"), "scripts", "addons_core", "bl_pkg"
 LEFT = [
     "refgs_addon/__pycache__/jobs.pyc", "refgs_addon/ui/__pycache__/a.pyc", "refgs_addon/jobs.pyc", "refgs_addon/.DS_Store",
     "run/splats.ply", "refgs/a", "reference/a.jpg", "refgs_runs/a", "refgs_addon.zip", "_out/a", "LOG.txt", "white ball/a.jpg",
-    "r", "wood/b", ".venv/c",
+    "r", "d/a", "dist/a.zip", "demo/run/a", "do/a", "docs.zip", "docs2/a.md", "doc/a.md", "wood/b", ".venv/c",
 ]  # fmt: skip
 
 
@@ -60,7 +62,8 @@ def test_registers_and_draws_without_numpy():
 def test_builds_and_validates(tmp_path):
     """Check that the built zip holds the extension only, though the repository's folder also holds runs and captures."""
     clone, archive = tmp_path / "refgs", tmp_path / "refgs.zip"
-    shutil.copytree(ROOT / "refgs_addon", clone / "refgs_addon")
+    for folder in ("refgs_addon", "docs"):
+        shutil.copytree(ROOT / folder, clone / folder)
     for name in ("__init__.py", "blender_manifest.toml", "LICENSE", "README.md"):
         shutil.copy(ROOT / name, clone)
     for left in LEFT:
@@ -70,7 +73,12 @@ def test_builds_and_validates(tmp_path):
         done = subprocess.run([sys.executable, TOOL, *arguments], capture_output=True, text=True)
         assert done.returncode == 0, done.stdout + done.stderr
     code = {str(path.relative_to(ROOT)) for path in (ROOT / "refgs_addon").rglob("*.py")}
-    assert set(zipfile.ZipFile(archive).namelist()) == code | {"__init__.py", "blender_manifest.toml", "LICENSE"}
+    pages = {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
+    assert set(zipfile.ZipFile(archive).namelist()) == code | pages | {
+        "__init__.py",
+        "blender_manifest.toml",
+        "LICENSE",
+    }
 
 
 def test_the_buttons(run_folder, addon, tmp_path):
@@ -88,6 +96,16 @@ def test_the_buttons(run_folder, addon, tmp_path):
     assert nodes["RefGS HDRI"].image.name == "environment.exr"
     bpy.ops.refgs.render_preview(filepath=str(tmp_path / "a.png"), size=16, samples=1)
     assert (tmp_path / "a.png").stat().st_size > 0
+
+
+def test_the_manual_is_opened_from_disk(addon, monkeypatch, tmp_path):
+    opened = []
+    monkeypatch.setattr(bpy.ops, "wm", SimpleNamespace(path_open=lambda filepath: opened.append(filepath)))
+    assert bpy.ops.refgs.open_manual() == {"FINISHED"}
+    assert opened == [str(ROOT / "docs" / "blender.md")]
+    monkeypatch.setattr(operators, "MANUAL", tmp_path / "blender.md")
+    with pytest.raises(RuntimeError, match=r"blender\.md does not exist"):
+        bpy.ops.refgs.open_manual()
 
 
 def test_dropped_files_stand_for_their_folders(run_folder, addon, tmp_path):
