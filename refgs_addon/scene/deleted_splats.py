@@ -20,7 +20,7 @@ def add_points(splats: bpy.types.Object) -> bpy.types.Object:
     splats.data.attributes["position"].data.foreach_get("vector", places)
     mesh.vertices.foreach_set("co", places)
     points = bpy.data.objects.new(mesh.name, mesh)
-    points.hide_render = points.show_in_front = True  # in front: splats would hide their own points
+    points.hide_render = True  # and not shown in front: all points together would cover the object
     stand_with(points, splats)
     splats.users_collection[0].objects.link(points)
     modifier = splats.modifiers.get(NAME) or splats.modifiers.new(NAME, "NODES")

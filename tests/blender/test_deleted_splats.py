@@ -87,6 +87,7 @@ def test_buttons_delete_and_restore(run_folder, addon):
     bpy.ops.refgs.delete_splats(splats=run.splats.name)
     points = points_of(run.splats)
     assert points.mode == "EDIT" and bpy.context.active_object == points and points.hide_render
+    assert not points.show_in_front  # all points together would cover the object
     assert not is_edited(run.splats)  # nothing is deleted yet
     bpy.ops.object.mode_set(mode="OBJECT")
     assert len(drawn(run)) == COUNT and not is_edited(run.splats)
