@@ -67,9 +67,8 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
         if jobs.run_state(folder):
             raise InputError(f"the training of {folder} has not ended: wait for it, or resume it")
         raise InputError(f"{folder} is not a run: it has no splats.ply. Choose the folder that a training wrote")
-    folder = Path(
-        os.path.abspath(folder)
-    )  # not resolved: by a link's target, a copied project would find the original's run
+    # Not resolved: by a link's target, a copied project would find the original's run.
+    folder = Path(os.path.abspath(folder))
     name, file = (folder.stem, folder) if alone else (folder.name, folder / "splats.ply")
     splats, left_out = read_splats(file)
     theirs = not is_ours(file)

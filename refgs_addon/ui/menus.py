@@ -18,12 +18,18 @@ from . import (
 )
 
 
+def _buttons(layout: bpy.types.UILayout, *kinds: type[bpy.types.Operator]) -> None:
+    for kind in kinds:
+        layout.operator(kind.bl_idname)
+
+
 class TrainMenu(bpy.types.Menu):
     bl_idname = "REFGS_MT_train"
     bl_label = "Train"
 
     def draw(self, context: bpy.types.Context) -> None:
-        for operator in (
+        _buttons(
+            self.layout,
             photo_buttons.PhotosFromVideo,
             train_panel.CheckCapture,
             train_panel.FindCameras,
@@ -34,8 +40,7 @@ class TrainMenu(bpy.types.Menu):
             train_panel.Train,
             many_panel.TrainMany,
             many_panel.ImportAsAssets,
-        ):
-            self.layout.operator(operator.bl_idname)
+        )
 
 
 class RunMenu(bpy.types.Menu):
@@ -43,9 +48,7 @@ class RunMenu(bpy.types.Menu):
     bl_label = "Run"
 
     def draw(self, context: bpy.types.Context) -> None:
-        self.layout.operator(operators.ImportRun.bl_idname)
-        self.layout.operator(operators.ImportSplats.bl_idname)
-        self.layout.operator(export_menu.ApplyEdits.bl_idname)
+        _buttons(self.layout, operators.ImportRun, operators.ImportSplats, export_menu.ApplyEdits)
         run = active_run(context)
         for part in parts(run) if run else ():
             button = self.layout.operator(operators.ShowPart.bl_idname, text=f"Show {part.title()}")
@@ -75,8 +78,7 @@ class LightMenu(bpy.types.Menu):
     bl_label = "Light"
 
     def draw(self, context: bpy.types.Context) -> None:
-        for operator in (light_panel.Relight, light_panel.RecoveredLight, light_panel.MatchLight):
-            self.layout.operator(operator.bl_idname)
+        _buttons(self.layout, light_panel.Relight, light_panel.RecoveredLight, light_panel.MatchLight)
 
 
 class PreviewMenu(bpy.types.Menu):
@@ -84,15 +86,15 @@ class PreviewMenu(bpy.types.Menu):
     bl_label = "Preview"
 
     def draw(self, context: bpy.types.Context) -> None:
-        for operator in (
+        _buttons(
+            self.layout,
             operators.NextCamera,
             operators.Photo,
             operators.Turntable,
             operators.RenderPreview,
             operators.ContactSheet,
             operators.MarkAsset,
-        ):
-            self.layout.operator(operator.bl_idname)
+        )
 
 
 class Menu(bpy.types.Menu):

@@ -14,11 +14,7 @@ from refgs.paths import whole
 
 EXTENSION = "KHR_gaussian_splatting"
 LARGEST = 0xFFFFFFFF  # bytes of a binary glTF file, by its header (glTF 2.0, 4.4.2)
-_FLOAT, _VERTICES, _POINTS = (
-    5126,
-    34962,
-    0,
-)  # glTF's numbers for a component type, a buffer's target, a primitive's mode
+_FLOAT, _VERTICES, _POINTS = 5126, 34962, 0  # glTF's numbers: a component type, a buffer's target, a primitive's mode
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 

@@ -26,14 +26,15 @@ from refgs.geometry.project import inside, project, sample
 from refgs.model import cubemap
 from refgs.model.environment import Environment
 from refgs.spread import spread
+from refgs.train.learn import light
 from refgs.train.material import same_material
-from refgs.train.material.observe import neighbours, pooled
+from refgs.train.material.observe import mean_over, neighbours
 from refgs.train.material.reckoning import Reckoned
 from refgs.train.state import State
 
-VIEWS = 24  # photos that base colours start from, at most
 DARKEST, BRIGHTEST = 0.02, 0.98  # base colours
 DRAWN = 0.3  # part of the way to the told base colour, each time
+LEAST_KNOWN = 0.02  # less spreads from afar
 LEAST_PART = 0.05  # fraction of the metals' pixels from which on what they mirror of the object tells
 AVERAGED = 64  # neighbours
 # The most that all paint of a capture has in the mean: the brightest channel, as a logarithm. In 30 rendered scenes, the true means are
@@ -53,21 +54,20 @@ def start(state: State, positions: np.ndarray, normals: np.ndarray) -> None:
 
     Surfels start at `positions` with `normals` (N, 3). Nothing changes without masks, or if the scene has no linear light.
     """
-    if not ({"albedo", "environment"} <= state.learned.keys() and state.from_hull) or state.method.light.display:
+    environment = state.environment()
+    if environment is None or state.method.light.display or "albedo" not in state.learned or not state.from_hull:
         return
     shown = torch.from_numpy(_shown(state.views, positions, normals)).to(state.device)
-    light = state.method.light.radiance(state.learned["environment"]).mean(dim=0)
-    color = shown / light
-    color = color / (color.amax(dim=1, keepdim=True) / BRIGHTEST).clamp_min(
-        1
-    )  # clamped alone, channels would lose their hue
+    color = shown / environment.radiance.mean(dim=0)
+    # If channels were clamped alone, colours would lose their hue.
+    color = color / (color.amax(dim=1, keepdim=True) / BRIGHTEST).clamp_min(1)
     state.learned["albedo"].copy_(torch.logit(plausible(color)))
 
 
 def _shown(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Average the linear radiance (N, 3) of photos at points with `positions` and `normals` (N, 3), over photos that they face."""
     sums = np.zeros((len(positions), 4), np.float32)
-    for view in spread(views, VIEWS):
+    for view in spread(views, light.VIEWS):
         pixels, depth = project(view.camera, positions)
         faces = np.einsum("na,na->n", normals, view.camera.position - positions) > 0
         seen = np.flatnonzero(inside(view.camera, pixels, depth) & faces)
@@ -90,8 +90,8 @@ def told(found: Reckoned, metals: Tensor) -> Tensor:
     weight = found.by_object * (2 * found.metal - 1).clamp_min(0)
     values = torch.cat([plausible(found.reflectance).log(), torch.ones_like(weight)[:, None]], dim=1)
     *sums, known = (same_material.spread(found.graph, each, weight) for each in values.T)
-    color = (torch.stack(sums, dim=1) / known.clamp_min(DARKEST)[:, None]).exp()
-    return torch.cat([plausible(color), known.clamp(0, 1)[:, None]], dim=1) * (known > DARKEST)[:, None]
+    color = (torch.stack(sums, dim=1) / known.clamp_min(LEAST_KNOWN)[:, None]).exp()
+    return torch.cat([plausible(color), known.clamp(0, 1)[:, None]], dim=1) * (known > LEAST_KNOWN)[:, None]
 
 
 @torch.no_grad()
@@ -99,7 +99,7 @@ def keep(state: State, metals: Tensor, paint: Tensor) -> None:
     """Draw base colours of `metals` (N,) to what photos tell, and balance lamps with `paint` (N,)."""
     raw, (color, known) = state.learned["albedo"], state.learned["shown_color"].split([3, 1], dim=1)
     logs = plausible(raw.sigmoid()).log()
-    drawn = torch.where(known > 0, DRAWN * known * (plausible(color).log() - logs), 0)
+    drawn = DRAWN * known * (plausible(color).log() - logs)
     logs = logs + metals[:, None] * drawn + paint[:, None] * _balance(state, logs, paint)
     raw.copy_(torch.where((metals | paint)[:, None], torch.logit(plausible(logs.exp())), raw))
 
@@ -111,8 +111,7 @@ def average(state: State, paint: Tensor) -> None:
         return
     raw, near = state.learned["albedo"], neighbours(state.learned["position"], AVERAGED, paint)
     weight = (paint * state.surfels().opacities)[:, None]
-    mean = pooled(weight * raw.sigmoid(), near) / pooled(weight, near).clamp_min(1e-6)
-    raw[paint] = torch.logit(plausible(mean))
+    raw[paint] = torch.logit(plausible(mean_over(near, raw.sigmoid(), weight)))
 
 
 def _balance(state: State, logs: Tensor, paint: Tensor) -> Tensor:
@@ -121,14 +120,15 @@ def _balance(state: State, logs: Tensor, paint: Tensor) -> Tensor:
     `logs` (N, 3) are logarithms of base colours. Texels whose radiance exceeds 1 are lamps: photos clip what mirrors them. Photos are
     balanced to white, so the light as a whole is drawn to grey. The smaller the part of lamps is, the less changes.
     """
-    light = Environment(state.method.light.radiance(state.learned["environment"]))
-    power = light.radiance * cubemap.texel_solid_angles(light.resolution).to(light.radiance).view(-1, 1)
-    whole, lamps = power.sum(dim=0), light.radiance > 1
+    radiance = state.method.light.radiance(state.learned["environment"])
+    environment = Environment(radiance)
+    power = radiance * cubemap.texel_solid_angles(environment.resolution).to(radiance).view(-1, 1)
+    whole, lamps = power.sum(dim=0), radiance > 1
     part = (power * lamps).sum(dim=0) / whole
     mean = (logs.amax(dim=1) * paint).sum() / paint.sum().clamp_min(1)
     wanted = (math.log(PAINT) - mean).clamp_max(0) + whole.log() - whole.log().mean()
     step = part * (STEP * wanted).clamp(-MOST_STEP, MOST_STEP)
     brighter = 1 + ((-step).exp() - 1) / part.clamp_min(1e-6)
     raw = state.learned["environment"]
-    raw.copy_(torch.where(lamps, state.method.light.raw(light.radiance * brighter), raw))
+    raw.copy_(torch.where(lamps, state.method.light.raw(radiance * brighter), raw))
     return step

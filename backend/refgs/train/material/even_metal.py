@@ -11,7 +11,7 @@ from torch import Tensor
 
 from refgs.model.surfels import Surfels
 from refgs.train.material.metals import Metals
-from refgs.train.material.observe import COLOURED, from_grey, neighbours, pooled
+from refgs.train.material.observe import COLOURED, from_grey, mean_over, neighbours
 from refgs.train.state import State
 from refgs.train.timeline import Step
 
@@ -34,8 +34,7 @@ def even_out(state: State, step: Step) -> None:
         return
     near = neighbours(surfels.positions, AVERAGED, metal)
     weight = (surfels.opacities * metal).view(-1, 1)
-    total = pooled(weight, near).clamp_min(1e-6)
     for name in {"albedo", "roughness"} & state.learned.keys():
         values = state.learned[name]
-        mean = pooled(weight * values.view(len(weight), -1), near) / total
+        mean = mean_over(near, values.view(len(weight), -1), weight)
         values[metal] = mean.view_as(values[metal])

@@ -91,7 +91,7 @@ def _judge(state: State, first: bool = False) -> None:
         roughness[fresh] = roughness[fresh].clamp_max(math.log(SHARP / (1 - SHARP)))
         state.learned.forget("roughness", fresh)
         fresh = _sure_kinds(state)[0] & (shown[:, 3] > 0)
-        albedo[fresh] = torch.logit(base_colors.plausible(shown[fresh, :3]))
+        albedo[fresh] = torch.logit(shown[fresh, :3])
         state.learned.forget("albedo", fresh)
     for name in names:
         state.learned.forget(name, raised | lowered)

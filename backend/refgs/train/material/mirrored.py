@@ -163,17 +163,13 @@ class _Sums:
         best = metal.argmin(dim=1)
         rows = best, torch.arange(len(best))
         weight = sums["power"][rows] if by_power else total.expand(-1, 3)
-        sums = reflectance[rows] * weight, weight, sums["shown"][rows], sums["light"][rows], light, total
-        chosen, weight, shown, full, light, pixels = pooled(torch.cat(sums, dim=1).float(), near).split(
-            [3, 3, 3, 3, 1, 1], dim=1
-        )
-        chosen, light, level = (
-            chosen / weight.clamp_min(1e-12),
-            light / pixels.clamp_min(1e-6),
-            shown / full.clamp_min(1e-6),
-        )
+        columns = reflectance[rows] * weight, weight, sums["shown"][rows], sums["light"][rows], light, total
+        summed = pooled(torch.cat(columns, dim=1).float(), near)
+        chosen, weight, shown, full, light, pixels = summed.split([3, 3, 3, 3, 1, 1], dim=1)
+        chosen, light = chosen / weight.clamp_min(1e-12), light / pixels.clamp_min(1e-6)
+        level = (shown / full.clamp_min(1e-6)).clamp(0, 1)
         rough = torch.tensor(self._roughnesses)[best]
-        values = ratio.clamp_min(1e-12).log(), chosen, rough, light[:, 0], pixels[:, 0], level.clamp(0, 1)
+        values = ratio.clamp_min(1e-12).log(), chosen, rough, light[:, 0], pixels[:, 0], level
         return Fit(*(each.float() for each in values))
 
 

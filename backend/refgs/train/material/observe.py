@@ -211,7 +211,7 @@ def averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, 
     change = pooled(observations.change * weight[..., None], near)
     change = torch.where(known[..., None], change / pixels.clamp_min(1e-6)[..., None], 0)
     seen = observations.pixels.sum(dim=1, keepdim=True)
-    mean = (pooled(observations.mean * seen, near) / pooled(seen, near).clamp_min(1e-6)).clamp_min(1e-4)
+    mean = mean_over(near, observations.mean, seen).clamp_min(1e-4)
     return mean, change, known
 
 
@@ -231,3 +231,8 @@ def pooled(values: Tensor, near: Tensor) -> Tensor:
     """Sum the rows of `values` (N, …) over neighbours `near` (M, K), giving (M, …)."""
     rows = values.reshape(len(values), -1)
     return torch.nn.functional.embedding_bag(near, rows, mode="sum").view(len(near), *values.shape[1:])
+
+
+def mean_over(near: Tensor, values: Tensor, weight: Tensor) -> Tensor:
+    """Average the rows of `values` (N, C), weighted by `weight` (N, 1), over neighbours `near` (M, K), giving (M, C)."""
+    return pooled(weight * values, near) / pooled(weight, near).clamp_min(1e-6)
