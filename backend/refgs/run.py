@@ -26,7 +26,7 @@ from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, from_splats
 from refgs.paths import write_text
 from refgs.render.baselines import method_of
-from refgs.render.relight import Progress, Transport, relit
+from refgs.render.relight import Progress, Relit, Transport, relit
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.run_folder import CHECKPOINTS, SPLATS, check_finished, check_free
 from refgs.settings import Settings
@@ -72,15 +72,14 @@ class Run:
         """Make a light for `render` from an equirectangular image (H, W, 3) of linear radiance."""
         return light_of(panorama, self.settings)
 
-    def relit(self, light: Environment, progress: Progress = lambda done, total: None) -> Surfels:
-        """Return the surfels as they look under another light.
+    def relit(self, light: Environment, progress: Progress = lambda done, total: None) -> Relit | None:
+        """Relight the surfels by another light, with the object's reflections of itself. Return None if the run has no inter-reflection.
 
-        If the run has inter-reflection, the object's reflections of itself are computed for this light too, with rays against the run's
-        mesh. The first call traces the rays, which takes seconds. Later calls reuse them. The result for the last light is cached.
-        progress(done, total) is called while rays are traced.
+        Rays are traced against the run's mesh. The first call traces the rays, which takes seconds. Later calls reuse them. The result for
+        the last light is cached. progress(done, total) is called while rays are traced.
         """
         if self.occluder is None:
-            return self.surfels().without_directions()  # learned under the recovered light: wrong under this one
+            return None
         with torch.no_grad():
             if "transport" not in self._traced:
                 surfels = self.surfels()
@@ -88,9 +87,10 @@ class Run:
                 self._traced["transport"] = Transport(surfels.turned(inward), self.occluder, progress=progress)
             if self._traced.get("light") is not light:
                 # Render with the learned rotations: near the horizon the side that a normal points to matters.
-                found = relit(self._traced["transport"], light)._replace(rotations=self.surfels().rotations)
-                self._traced.update(light=light, surfels=found)
-        return self._traced["surfels"]
+                found = relit(self._traced["transport"], light)
+                found = found._replace(surfels=found.surfels._replace(rotations=self.surfels().rotations))
+                self._traced.update(light=light, relit=found)
+        return self._traced["relit"]
 
     def render(
         self, camera: Camera, environment: Environment | None = None, exposure: float | np.ndarray = 1.0
@@ -99,16 +99,18 @@ class Run:
 
         If `environment` is given, the surfels are relit by it; otherwise the light recovered in training is used.
         """
-        surfels, settings = self.surfels(), self.settings.render
+        surfels, settings, lit = self.surfels(), self.settings.render, None
         if environment is not None:
-            surfels = self.relit(environment)
-            diffuse = "irradiance" if self.occluder is None else "sh"
+            lit = self.relit(environment)
+            # Colours by direction were learned under the recovered light: they are wrong under this one.
+            surfels = surfels.without_directions() if lit is None else lit.surfels
+            diffuse = "irradiance" if lit is None else "sh"
             reflection = "none" if settings.reflection == "none" else "microfacet"
             settings = settings.model_copy(update={"diffuse": diffuse, "reflection": reflection})
         light, background = environment or self.environment, torch.tensor(self.settings.image.background)
         with torch.no_grad():
             factors = torch.tensor(np.broadcast_to(exposure, 3), dtype=torch.float32)
-            return render(surfels, light, camera, background, settings, self.near, self.occluder, factors)
+            return render(surfels, light, camera, background, settings, self.near, self.occluder, factors, lit)
 
 
 def create_run(

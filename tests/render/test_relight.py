@@ -34,7 +34,7 @@ def test_an_open_plane_has_the_whole_light():
     plane = surfels(np.zeros((5, 3)), up)
     transport = relight.Transport(plane, as_occluder(plate(0.0, 1)))
     assert torch.equal(relight._gather(transport, light, 4)[0], light.diffuse(transport.normals))
-    lit = relight.relit(transport, light)
+    lit = relight.relit(transport, light).surfels
     for angle in (0.0, 0.5, 1.0, 1.3):
         camera = look_at([3 * math.sin(angle), 0, 3 * math.cos(angle)], 8)
         found = directional(lit.sh_dc, lit.sh_rest, 0.5, lit.positions, camera)[0]
@@ -64,7 +64,7 @@ def test_inside_a_matte_bowl(albedo, monkeypatch):
     """Check the light in a matte bowl. A point sees half sky, half bowl, so it receives x = 1/2 + albedo · x / 2."""
     occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
-    found, _ = relight._gather(relight.Transport(surfels(points, normals, albedo), occluder), even(), 20)
+    found, _, _ = relight._gather(relight.Transport(surfels(points, normals, albedo), occluder), even(), 20)
     exact = 0.5 / (1 - albedo / 2)
     assert abs(float(found.mean()) / exact - 1) < 0.01
     assert float((found / exact - 1).square().mean().sqrt()) < 0.02
@@ -100,12 +100,17 @@ def test_a_white_bowl_under_an_even_sky_cannot_be_seen(part, monkeypatch):
     occluder, points, normals = bowl()
     mirrors(monkeypatch, part)
     transport = relight.Transport(surfels(points, normals, 1.0), occluder)
-    found, indirect = relight._gather(transport, even(), 20)
+    found, _, indirect = relight._gather(transport, even(), 20)
     torch.testing.assert_close(found, torch.ones_like(found), rtol=0, atol=0.01)
     across = torch.tensor([0.0, 0.0, -1.0]) - transport.normals * -transport.normals[:, 2:]
     ways = torch.nn.functional.normalize(transport.normals + 0.5 * across, dim=1)  # tilted towards the bowl's bottom
     seen = torch.einsum("nk,nkc->nc", harmonics.basis(ways, 3), indirect)
     torch.testing.assert_close(seen, torch.ones_like(seen), rtol=0, atol=0.03)
+    face, weights = occluder.meet(points, normals, ways.double().numpy())
+    met = face >= 0
+    mirrored = relight.relit(transport, even(), 20).mirrored(face[met], weights[met], ways.double().numpy()[met])
+    assert met.mean() > 0.3
+    torch.testing.assert_close(mirrored, torch.ones_like(mirrored), rtol=0, atol=0.03)
 
 
 def test_a_mirror_sends_the_light_that_it_faces(monkeypatch):
@@ -123,6 +128,11 @@ def test_a_mirror_sends_the_light_that_it_faces(monkeypatch):
     free = transport.free
     assert free.float().mean() > 0.9
     torch.testing.assert_close(first[free], colour(ways)[free], rtol=0, atol=0.05)
+    directions = transport.directions[transport.direction.long()][free].double().numpy()
+    start = np.zeros((len(directions), 3))
+    face, weights = transport.occluder.meet(start, np.tile([0.0, 0.0, 1.0], (len(directions), 1)), directions)
+    mirrored = relight.relit(transport, light).mirrored(face, weights, directions)
+    torch.testing.assert_close(mirrored, colour(ways)[free], rtol=0, atol=0.01)
 
 
 def test_a_light_that_the_object_hides_reaches_nothing():

@@ -5,10 +5,13 @@ small sun falls into exactly one part. Rays are traced once. After that, each ne
 
 A point that a ray hits reflects two kinds of light, by the split sum. It reflects the environment where the object does not occlude the
 point's mirror direction. It also reflects the light that other points reflected in the previous bounce.
+
+What a smooth surface mirrors of the object is too sharp for that. So each pixel also traces its mirror ray, from point to point (`Relit`).
 """
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -150,17 +153,62 @@ def blend(surfels: Surfels, normals: np.ndarray, points: np.ndarray, outward: np
     return sparse.csr_matrix((weight.ravel().astype(np.float32), at.ravel(), rows), (len(points), len(positions)))
 
 
-def relit(transport: Transport, light: Environment, bounces: int = BOUNCES) -> Surfels:
-    """Return the surfels relit by `light`: with new `sh_*` (diffuse colour) and `indirect_*` (radiance from the object itself).
+class Relit(NamedTuple):
+    """Hold an object under a light. Render its `surfels` with the setting diffuse = "sh" and with the occluder of `transport`.
 
-    `transport` holds the surfels' traced rays. `bounces` counts the reflections between parts of the object. Render the result with the
-    setting diffuse = "sh" and with the occluder of `transport`.
+    `received` (V, 3) is irradiance / π at the mesh's vertices, and `around` (V, 3) the mean radiance that they see of the object.
     """
-    received, indirect = _gather(transport, light, bounces)
+
+    surfels: Surfels
+    transport: Transport
+    light: Environment
+    received: Tensor
+    around: Tensor
+
+    def mirrored(self, face: np.ndarray, weights: np.ndarray, directions: np.ndarray) -> Tensor:
+        """Compute the radiance (P, 3) that comes back along P rays with unit `directions` (P, 3).
+
+        The rays hit the faces `face` (P,) at barycentric `weights` (P, 3). From there, each follows its mirror direction until it leaves
+        the object, at most BOUNCES times.
+        """
+        transport, mesh = self.transport, self.transport.occluder.mesh
+        levels = cubemap.in_texel_order(self.light.levels, self.light.sides)
+        radiance, share = torch.zeros(len(face), 3), torch.ones(len(face), 3)
+        at_vertices = torch.cat([transport.material, self.received, self.around], dim=1).numpy()
+        rays = torch.arange(len(face))
+        for bounce in range(BOUNCES):
+            corners = mesh.faces[face]
+            values = torch.from_numpy(np.einsum("pkc,pk->pc", at_vertices[corners], weights.astype(np.float32)))
+            albedo, metallic, roughness, received, around = values.split((3, 1, 1, 3, 3), dim=1)
+            normals = _unit(np.einsum("pka,pk->pa", transport.vertex_normals[corners], weights))
+            cosine = torch.from_numpy(-np.einsum("pa,pa->p", directions, normals)).float().clamp(0, 1)
+            specular, diffuse = _split_sum(albedo, metallic[:, 0], roughness[:, 0], cosine)
+            radiance[rays] += share[rays] * diffuse * received
+            share[rays] *= specular
+            points, directions = np.einsum("pka,pk->pa", mesh.vertices[corners], weights), mirror(directions, normals)
+            face, weights = transport.occluder.meet(points, normals, directions)
+            brought = _prefiltered(levels, self.light.sides, torch.from_numpy(directions).float(), roughness[:, 0])
+            met = torch.from_numpy(face >= 0)
+            # What a ray meets adds its light in the next round.
+            brought[met] = around[met] if bounce == BOUNCES - 1 else 0.0
+            radiance[rays] += share[rays] * brought
+            rays, face, weights, directions = rays[met], face[face >= 0], weights[face >= 0], directions[face >= 0]
+            if not met.any():
+                break
+        return radiance
+
+
+def relit(transport: Transport, light: Environment, bounces: int = BOUNCES) -> Relit:
+    """Relight surfels by `light`: with new `sh_*` (diffuse colour) and `indirect_*` (radiance from the object itself).
+
+    `transport` holds the surfels' traced rays. `bounces` counts the reflections between parts of the object.
+    """
+    received, around, indirect = _gather(transport, light, bounces)
     sh = _diffuse_harmonics(transport.surfels, transport.normals, received)
-    return transport.surfels._replace(
+    surfels = transport.surfels._replace(
         sh_dc=sh[:, :1], sh_rest=sh[:, 1:], indirect_dc=indirect[:, :1], indirect_rest=indirect[:, 1:]
     )
+    return Relit(surfels, transport, light, transport.at_vertices(received), transport.at_vertices(around))
 
 
 def received(surfels: Surfels, occluder: Occluder, light: Environment) -> Tensor:
@@ -177,15 +225,15 @@ def received(surfels: Surfels, occluder: Occluder, light: Environment) -> Tensor
     chosen = torch.randperm(len(positions), generator=torch.Generator().manual_seed(0))[:PROBES]
     probes = surfels.chosen(chosen)
     traced = Transport(probes, occluder, PROBE_DIRECTIONS)
-    found, _ = _gather(traced, light, BOUNCES)
+    found, _, _ = _gather(traced, light, BOUNCES)
     part = (found / light.diffuse(traced.normals).clamp_min(1e-6)).clamp_max(MOST_RECEIVED)
     wide = probes._replace(scales=probes.scales * math.sqrt(len(positions) / len(chosen)))
     weights = blend(wide, traced.normals.double().numpy(), positions, surfels.normals().double().numpy())
     return torch.from_numpy(weights @ part.numpy())
 
 
-def _gather(transport: Transport, light: Environment, bounces: int) -> tuple[Tensor, Tensor]:
-    """Compute irradiance / π (N, 3), and harmonics (N, 16, 3) of the object's radiance."""
+def _gather(transport: Transport, light: Environment, bounces: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute irradiance / π (N, 3), the object's mean radiance (N, 3) and its harmonics (N, 16, 3)."""
     past = _past_the_object(transport, light)
     levels = cubemap.in_texel_order(light.levels, light.sides)
     firsts = [_first(transport, rays, levels, light.sides) for _, rays, _ in transport.chunks()]
@@ -217,7 +265,7 @@ def _gather(transport: Transport, light: Environment, bounces: int) -> tuple[Ten
         ).clamp_min(0)
     found = harmonic_sums(received, mean, WHITE)
     found[:, 0] += PRIOR * found[:, 0].sum(dim=0) / max(len(transport.vertex), 1)
-    return received, transport.fit @ found
+    return received, mean, transport.fit @ found
 
 
 def _first(transport: Transport, rays: slice, levels: Tensor, sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:

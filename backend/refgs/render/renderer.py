@@ -15,6 +15,7 @@ from refgs.render.baselines import method_of
 from refgs.render.channels import channels
 from refgs.render.directional import directional
 from refgs.render.rasterize import rasterize
+from refgs.render.relight import Relit
 from refgs.render.rendering import COVERED, Rendering
 from refgs.render.shade import mirror_directions, shade
 from refgs.render.stack import stack
@@ -22,6 +23,9 @@ from refgs.render.volume import discs
 from refgs.settings import RenderSettings
 
 NEAR = 0.01  # the nearest depth that is drawn, in scene radii
+ROUGHNESS = 7  # channel of the blended features
+# Up to a roughness of SMOOTH, one mirror ray is better than harmonics of degree 3; from ROUGH on, it is worse.
+SMOOTH, ROUGH = 0.3, 0.5
 SIGNED = 1.0  # added to the residual while it is blended: it may be negative, and `directional` clamps at 0
 
 
@@ -35,8 +39,13 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 
 @timed("visibility")
-def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, occluder: Occluder) -> Tensor:
-    """Return 0 (H, W) where the object blocks a pixel's mirror ray, else 1."""
+def _visibility(
+    features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, occluder: Occluder, relit: Relit | None
+) -> Tensor:
+    """Return 0 (H, W) where the object blocks a pixel's mirror ray, else 1.
+
+    With `relit`, the radiance that smooth surfaces mirror of the object is changed, in place, to what their rays meet.
+    """
     directions = mirror_directions(features, alpha, camera)
     if load.on_gpu(alpha):
         return occluder.tree(alpha.device).visible(directions, alpha, depth, camera)
@@ -47,9 +56,17 @@ def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, 
     mean_depth = (depth / alpha).detach().numpy().reshape(-1, 1)[covered]
     points = rays * mean_depth + camera.position
     normals = mirrored - _unit(rays)  # half way back to the camera
-    visible = np.ones(alpha.shape, np.float32)
-    visible.reshape(-1)[covered] = occluder.visible(points, _unit(normals), mirrored)
-    return torch.from_numpy(visible)
+    visible = torch.ones(alpha.shape)
+    face, weights = occluder.meet(points, _unit(normals), mirrored)
+    met = face >= 0
+    pixels = torch.from_numpy(covered[met])
+    visible.view(-1)[pixels] = 0
+    if relit is not None and met.any():
+        radiance = relit.mirrored(face[met], weights[met], mirrored[met])
+        blended, whole = features.view(-1, features.shape[-1]), alpha.view(-1)[pixels, None]
+        sharp = ((ROUGH - blended[pixels, ROUGHNESS, None] / whole) / (ROUGH - SMOOTH)).clamp(0, 1)
+        blended[pixels, -6:-3] = torch.lerp(blended[pixels, -6:-3], radiance * whole, sharp)
+    return visible
 
 
 def render(
@@ -61,6 +78,7 @@ def render(
     near: float,
     occluder: Occluder | None = None,
     exposure: Tensor | None = None,
+    relit: Relit | None = None,
 ) -> Rendering:
     """Render surfels for a camera: blend their features, then shade each pixel by the split sum (Ref-Gaussian paper, Eq. 5–8).
 
@@ -69,6 +87,7 @@ def render(
 
     `occluder` is the object's mesh, for reflections of the object in itself. Where the mesh blocks a pixel's mirror direction, the pixel
     reflects radiance from the object. The surfels store this radiance (Ref-Gaussian paper, Eq. 9). Other pixels reflect `environment`.
+    With `relit`, the object under another light whose surfels are given, smooth surfaces instead reflect what their mirror rays meet.
 
     If the setting diffuse is "irradiance", `surfels.sh_rest` may hold a residual: a view-dependent colour, sRGB-encoded, that is added to
     the picture. It stands for what material and light cannot explain in the photos.
@@ -89,7 +108,7 @@ def render(
     features, depth, alpha = rasterize(*discs(surfels, camera), stack(blended), camera, near=near)
     if has_residual:
         residual, features = features.split((3, features.shape[-1] - 3), dim=-1)
-    visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
+    visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder, relit)
     how = method.light.display, method.mirror, settings.diffuse == "sh", matte
     shaded = shade(features, alpha, environment, camera, background, visibility, exposure, *how)
     color = shaded.color if residual is None else shaded.color + (residual - SIGNED * alpha[..., None])
