@@ -133,7 +133,7 @@ def main() -> None:
     command = json.loads(sys.stdin.readline() or "null")
     if command is None:
         return
-    threading.Thread(target=exit_with_stdin, daemon=True).start()
+    threading.Thread(target=_exit_with_stdin, daemon=True).start()
     job = command.pop("command")
     _emit("started", job=job)
     try:
@@ -157,7 +157,7 @@ def _emit(event: str, **facts) -> None:
         print(json.dumps({"event": event} | facts), flush=True)
 
 
-def exit_with_stdin() -> None:
+def _exit_with_stdin() -> None:
     """Wait for the end of stdin, then kill the child process and exit."""
     sys.stdin.read()
     with _starting:  # no child is started after this

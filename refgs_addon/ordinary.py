@@ -3,10 +3,10 @@
 import errno
 import json
 import os
+import re
 import stat
 from pathlib import Path
 from typing import BinaryIO
-from urllib.parse import unquote, urlsplit
 
 from .errors import InputError
 
@@ -65,8 +65,11 @@ def check_gltf(path: Path) -> None:
 
 
 def _check_beside(path: Path, uri: str) -> None:
-    name = unquote(uri).replace("\\", "/")
+    decoded = re.sub(
+        rb"%([0-9a-fA-F]{2})", lambda code: bytes.fromhex(code[1].decode()), uri.encode("utf-8", "replace")
+    )
+    name = decoded.decode("utf-8", "replace").replace("\\", "/")
     parts = name.split("/")
-    if urlsplit(uri).scheme or ":" in name or not parts[0] or ".." in parts:
+    if ":" in name or not parts[0] or ".." in parts:
         raise InputError(f"{path} names a file outside of its folder, {uri[:100]}: import a mesh that you trust")
     check_file(path.parent / name)

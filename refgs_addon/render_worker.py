@@ -16,7 +16,6 @@ import threading
 from pathlib import Path
 
 from .errors import InputError, missing_module
-from .installation import exit_with_stdin
 from .jobs import PROTOCOL
 
 
@@ -31,7 +30,7 @@ def main() -> None:
     say("ready", protocol=PROTOCOL, refgs="")
     command = json.loads(sys.stdin.readline())
     job = command["command"]
-    threading.Thread(target=exit_with_stdin, daemon=True).start()
+    threading.Thread(target=_exit_with_stdin, daemon=True).start()
     say("started", job=job)
     try:
         facts = {"render": _render, "library": _library}[job](command, say)
@@ -46,6 +45,11 @@ def main() -> None:
     finally:
         events.flush()
     os._exit(0)  # Blender's own clean-up at exit can hang
+
+
+def _exit_with_stdin() -> None:
+    sys.stdin.read()
+    os._exit(1)
 
 
 def _render(command: dict, say) -> dict:

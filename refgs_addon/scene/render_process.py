@@ -13,7 +13,12 @@ from ..job_timers import follow_jobs
 from ..preferences import log_file
 
 ROOT = Path(__file__).resolve().parents[2]  # contains the package refgs_addon
-_START = "import sys; sys.path.insert(0, {root!r}); import refgs_addon.render_worker as background; background.main()"
+# The other Blender knows none of this one's repositories of extensions: add a repository for it that contains this add-on's code.
+_START = """
+import bpy, importlib
+repository = bpy.context.preferences.extensions.repos.new(name="RefGS", module="refgs", custom_directory={root!r})
+importlib.import_module("bl_ext." + repository.module + ".refgs_addon.render_worker").main()
+"""
 _numbers = itertools.count()
 
 
@@ -46,7 +51,7 @@ def start_blender(name: str, log: str, command: Mapping[str, object], file: str 
     program = bpy.app.binary_path
     if not program:  # Blender runs as a Python module
         opened = f"bpy.ops.wm.open_mainfile(filepath={file!r}); " if file else ""
-        program, words = sys.executable, ("-c", f"import bpy; {opened}{start}")
+        program, words = sys.executable, ("-c", f"import bpy; {opened}\n{start}")
     job = jobs.in_blender(name, Path(program), words, command, log_file(log))
     follow_jobs()
     return job
