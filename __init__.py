@@ -2,12 +2,14 @@
 
 
 def register() -> None:
-    from .refgs_addon import ui
+    from .refgs_addon import hooks, ui
 
     ui.register()
+    hooks.tell_extensions("refgs_enabled", __package__)
 
 
 def unregister() -> None:
-    from .refgs_addon import ui
+    from .refgs_addon import hooks, ui
 
+    hooks.tell_extensions("refgs_disabled")
     ui.unregister()

@@ -10,10 +10,9 @@ from collections.abc import Callable, Iterator
 import bpy
 
 from .nodes.panorama_world import get_light, is_panorama
-from .scene.camera_objects import MASK, PHOTO
+from .scene.camera_objects import MASK, PHOTO, STROKES
 from .scene.capture_cameras import CAPTURE
 from .scene.run_parts import FOLDER
-from .scene.strokes import STROKES
 
 
 def change_paths(change: Callable[[str], str]) -> None:

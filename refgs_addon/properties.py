@@ -1,4 +1,7 @@
-"""Define the properties stored in the .blend: the capture (a folder with photos), the training settings and the list of runs."""
+"""Define the properties stored in the .blend: the capture (a folder with photos), the training settings and the list of runs.
+
+Only the trainer's extension shows most of them. They are defined here so that a file keeps them, and their paths, without it.
+"""
 
 import bpy
 from bpy.props import (
@@ -12,7 +15,6 @@ from bpy.props import (
 )
 
 from .compat import BLEND_RELATIVE
-from .scene.batch_table import forget_table
 from .scene.run_parts import ROOT
 
 
@@ -47,17 +49,6 @@ class Many(bpy.types.PropertyGroup):
         options=BLEND_RELATIVE,
     )
     preset: EnumProperty(name="Quality", items=PRESETS, default="quick")
-
-
-class BatchRow(bpy.types.PropertyGroup):
-    """Hold a row of the table of a batch, with the fields of `scene.batch_table.Row`."""
-
-    name: StringProperty()
-    state: StringProperty()
-    words: StringProperty()
-    what: StringProperty()
-    log: StringProperty()
-    picture: StringProperty()
 
 
 class Training(bpy.types.PropertyGroup):
@@ -154,13 +145,11 @@ class Training(bpy.types.PropertyGroup):
     many: PointerProperty(type=Many)
 
 
-CLASSES = (KnownRun, Many, BatchRow, Training)
+CLASSES = (KnownRun, Many, Training)
 
 
 def register() -> None:
     bpy.types.Scene.refgs = PointerProperty(type=Training, name="RefGS")
-    bpy.types.WindowManager.refgs_rows = CollectionProperty(type=BatchRow)
-    bpy.types.WindowManager.refgs_row = IntProperty(name="Run", description="Selected run of the batch")
     bpy.types.Object.refgs_longest_side = FloatProperty(
         name="Longest Side",
         description="Size of the object: the longest side of a box around it. Photos do not tell it; type it in",
@@ -172,8 +161,6 @@ def register() -> None:
 
 
 def unregister() -> None:
-    forget_table()
-    del bpy.types.WindowManager.refgs_rows, bpy.types.WindowManager.refgs_row
     del bpy.types.Scene.refgs, bpy.types.Object.refgs_longest_side
 
 

@@ -1,7 +1,8 @@
-"""Check that modules of the trainer and of the extension import only what they may.
+"""Check that modules of the trainer and of the extensions import only what they may.
 
 The trainer's packages are ordered in layers, called floors. A module imports only from its own floor and from those below. There are no
-import cycles. The trainer never imports bpy. The extension never imports torch. Only tests and benchmarks import the float64 reference.
+import cycles. The trainer never imports bpy. The extensions never import torch. The extension RefGS imports nothing of the trainer's
+extension. Only tests and benchmarks import the float64 reference.
 
     python scripts/check_imports.py [FOLDER]      # this repository, or a folder that is laid out like it
 
@@ -63,7 +64,12 @@ ROOMS = (
     ("fit", "hints"),
 )
 ORACLE = "refgs.render.reference"  # float64, for tests and benchmarks, which compare the kernels with it
-FORBIDDEN = {"backend": ("bpy", "refgs_addon"), "refgs_addon": ("torch", "refgs")}
+TRAINER = "refgs_addon.trainer"  # the trainer's extension has it; without that, the add-on runs all the same
+FORBIDDEN = {
+    "backend": ("bpy", "refgs_addon", "refgs_trainer"),
+    "refgs_addon": ("torch", "refgs", "refgs_trainer"),
+    "refgs_trainer": ("torch", "refgs", "refgs_addon"),
+}
 
 
 class Import(NamedTuple):
@@ -136,13 +142,20 @@ def floor(module: str) -> float | None:
 def check(root: Path) -> list[str]:
     """Check all imports of the repository in `root`. Returns a message for each broken rule."""
     wrong = []
-    for half, folder, package in (("backend", root / "backend", "refgs"), ("refgs_addon", root, "refgs_addon")):
+    for half, folder, package in (
+        ("backend", root / "backend", "refgs"),
+        ("refgs_addon", root, "refgs_addon"),
+        ("refgs_trainer", root, "refgs_trainer"),
+    ):
         files = modules(folder, package)
         found = list(imports(files, root))
         for source, target, place in found:
             if (name := target.split(".")[0]) in FORBIDDEN[half]:
                 wrong.append(f"{place}: {source} imports {target}: nothing under {half}/ imports {name}")
         inside = [i for i in found if i.target in files]
+        for source, target, place in inside:
+            if f"{target}.".startswith(f"{TRAINER}.") and not f"{source}.".startswith(f"{TRAINER}."):
+                wrong.append(f"{place}: {source} imports {target}: only modules of {TRAINER} do")
         if package == "refgs":
             lost = [name for name in files if floor(name) is None]
             wrong += [

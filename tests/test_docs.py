@@ -11,7 +11,7 @@ from refgs.cli import app
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
-FOLDERS = ("backend", "refgs_addon", "tests", "benchmarks", "scripts")
+FOLDERS = ("backend", "refgs_addon", "refgs_trainer", "tests", "benchmarks", "scripts")
 LINK = re.compile(r"\]\((?!https?:)([^)#]*)(?:#([^)]*))?\)")
 COMMAND = re.compile(r"refgs ([a-z]+)\b([^\n`#|]*)")
 BUTTON = re.compile(r"\*\*(\w[^*]+)\*\*")
@@ -57,7 +57,7 @@ def drawn_labels():
     They are the strings in values of LABELS, directly or in a constant of the same file, without "…" and endings such as " (.ply)".
     """
     found = set()
-    for file in (ROOT / "refgs_addon").rglob("*.py"):
+    for file in (*(ROOT / "refgs_addon").rglob("*.py"), *(ROOT / "refgs_trainer").rglob("*.py")):
         tree = ast.parse(file.read_text(encoding="utf-8"))
         assigned = [(node.targets[0], node.value) for node in ast.walk(tree) if isinstance(node, ast.Assign)]
         values = {target.id: value for target, value in assigned if isinstance(target, ast.Name)}

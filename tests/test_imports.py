@@ -35,6 +35,10 @@ def write(root, files):
         "refgs_addon/errors.py": "",
         "refgs_addon/scene/__init__.py": "",
         "refgs_addon/scene/run.py": "from ..jobs import start",
+        "refgs_addon/trainer/__init__.py": "from ..jobs import start",
+        "refgs_addon/trainer/install.py": "from ..scene import run\nfrom . import ui",
+        "refgs_addon/trainer/ui.py": "",
+        "refgs_trainer/__init__.py": "import bpy",
     }
     for name, text in (right | files).items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -70,6 +74,9 @@ HIDDEN = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from refgs.tr
         ("backend/refgs/camera.py", "from bpy.types import A", ["camera.py:1", "nothing under backend/ imports bpy"]),
         ("refgs_addon/jobs.py", "import torch.cuda", ["jobs.py:1", "nothing under refgs_addon/ imports torch"]),
         ("refgs_addon/jobs.py", "from refgs import run", ["jobs.py:1", "nothing under refgs_addon/ imports refgs"]),
+        ("refgs_addon/jobs.py", "from . import trainer", ["jobs.py:1", "only modules of refgs_addon.trainer do"]),
+        ("refgs_addon/scene/run.py", "from ..trainer.ui import f", ["run.py:1", "only modules of refgs_addon.trainer"]),
+        ("refgs_trainer/__init__.py", "import refgs_addon", ["nothing under refgs_trainer/ imports refgs_addon"]),
         (
             "backend/refgs/train/adam.py",
             "from refgs.render import reference",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from refgs_addon import installation, jobs
+from refgs_addon.trainer import commands, installation
 from tests.makers.waiting import final_state, until
 
 pytest.importorskip("bpy", reason="the extension is built with the tool in Blender's Python module")
@@ -20,10 +20,11 @@ NAMES = {("Linux", "x86_64"): "linux_x64", ("Windows", "AMD64"): "windows_x64", 
 
 @pytest.fixture(scope="module")
 def archives(tmp_path_factory):
-    """Build and validate the zips of all platforms. Return their paths by platform."""
+    """Build and validate the zips of the trainer's extension for all platforms. Return their paths by platform."""
     out = tmp_path_factory.mktemp("dist")
     subprocess.run([sys.executable, ROOT / "scripts" / "build_extension.py", out], check=True)
-    return {archive.stem.split("-")[-1]: archive for archive in out.glob("*.zip")}
+    assert len(list(out.glob("refgs-*.zip"))) == 1
+    return {archive.stem.split("-")[-1]: archive for archive in out.glob("refgs_trainer-*.zip")}
 
 
 @pytest.fixture
@@ -49,8 +50,8 @@ def test_locks_hold_what_the_trainer_needs_and_no_address(archives):
 
 
 def test_the_zips(archives):
-    code = {str(path.relative_to(ROOT)) for path in (ROOT / "refgs_addon").rglob("*.py")}
-    code |= {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
+    code = {str(path.relative_to(ROOT / "refgs_addon")) for path in (ROOT / "refgs_addon" / "trainer").rglob("*.py")}
+    code |= {path.name for path in (ROOT / "refgs_trainer").glob("*.py")}
     assert set(archives) == set(NAMES.values())
     for archive in archives.values():
         names = set(zipfile.ZipFile(archive).namelist())
@@ -59,7 +60,7 @@ def test_the_zips(archives):
         locks = {name for name in names if name.startswith("wheels/lock")}
         assert "wheels/lock.txt" in locks
         assert {name for name in names if not name.endswith(".whl")} == code | locks | {
-            "__init__.py", "blender_manifest.toml", "LICENSE",
+            "blender_manifest.toml", "LICENSE",
         }  # fmt: skip
 
 
@@ -75,7 +76,7 @@ def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
     zipfile.ZipFile(archive).extractall(tmp_path / "extension")
     monkeypatch.setattr(installation, "WHEELS", tmp_path / "extension" / "wheels")
     home = tmp_path / "user folder" / "trainer"
-    job, lines = jobs.install(home, tmp_path / "log.txt"), []
+    job, lines = commands.install(home, tmp_path / "log.txt"), []
 
     def done():
         if job.line and job.line not in lines:
@@ -91,9 +92,9 @@ def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
     assert any(line.startswith("Fetching ") for line in lines)
     origin = installation.origin(home)
     assert origin.startswith("All packages are those of the release, by their hashes") and "(torch 2." in origin
-    asked = jobs.query_trainer(installation.python(home), tmp_path / "asked.txt")
+    asked = commands.query_trainer(installation.python(home), tmp_path / "asked.txt")
     assert final_state(asked, seconds=200) == "done" and asked.ready == job.ready
     program = "from refgs.settings import load_settings; print(load_settings('quick').train.iterations)"
     subprocess.run([installation.python(home), "-E", "-c", program], check=True, cwd=tmp_path)
-    removed = jobs.remove(home, tmp_path / "removed.txt")
+    removed = commands.remove(home, tmp_path / "removed.txt")
     assert final_state(removed, seconds=200) == "done" and not home.exists()

@@ -1,27 +1,16 @@
-"""Turn the finished runs of a batch into an asset library: a folder of .blend files, one for each run.
-
-A batch trains all captures of a folder (`scene.many`). Blender's asset browser shows the library.
-"""
+"""Write runs into an asset library: a folder of .blend files, one for each run. Blender's asset browser shows the library."""
 
 from pathlib import Path
 
 import bpy
 
-from .. import jobs
-from ..errors import InputError
 from .atomic_file import atomic_write, unwritable
-from .batch_table import Row, read_rows
 
 LIBRARY = "library"  # folder among the runs, as in backend/refgs/batch/listing.py
 CATALOG = "RefGS"
 CATALOG_ID = "8f1f0b52-6a0c-4c34-9b59-4f0c3d3b7c21"
 _CATALOGS = "blender_assets.cats.txt"  # the file in which Blender looks for a library's catalogs
 _HEADER = "# This is an Asset Catalog Definition file for Blender.\n\nVERSION 1\n\n"
-
-
-def missing_assets(folder: Path) -> list[Row]:
-    """List the finished runs in a batch's folder that have no asset yet."""
-    return [row for row in read_rows(folder) if row.state == "done" and not asset_file(folder, row.name).exists()]
 
 
 def asset_file(folder: Path, name: str) -> Path:
@@ -32,29 +21,6 @@ def asset_file(folder: Path, name: str) -> Path:
 def library_name(folder: Path) -> str:
     """Return the name of a batch's library in the asset browser."""
     return f"{folder.name} {LIBRARY}"
-
-
-def import_as_assets(folder: Path) -> jobs.Job:
-    """Start a job that makes each finished run of a batch an asset, and then lists the library in Blender's preferences.
-
-    `folder` is the folder of the batch's runs. Runs that are in the library already are left out. The job runs in another Blender process,
-    so the open file does not change. Raises InputError if there is no run to import, or if such a job for this batch is running already.
-    """
-    from .render_process import start_blender
-
-    rows = missing_assets(folder)
-    if not rows:
-        known = (folder / LIBRARY).is_dir()
-        what = "all finished runs are in the library" if known else "no run has finished"
-        raise InputError(f"{folder.name}: {what}: train more captures first")
-    if any(job.kind == "library" and job.commands[0]["folder"] == str(folder) and not job.ended for job in jobs.JOBS):
-        raise InputError(f"the assets of {folder.name} are being made already: wait for them")
-    jobs.JOBS[:] = [job for job in jobs.JOBS if not (job.ended and job.kind == "library")]
-    runs = [{"name": row.name, "picture": row.picture} for row in rows]
-    command = {"command": "library", "folder": str(folder), "runs": runs}
-    job = start_blender(library_name(folder), f"library {folder.name}", command)
-    job.then = lambda job: add_library(folder)
-    return job
 
 
 def write_asset(run: Path, picture: Path | None, file: Path) -> None:

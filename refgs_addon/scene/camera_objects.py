@@ -14,6 +14,9 @@ LARGEST = 1e6  # pixels of a photo or of a focal length; Blender stores single-p
 SENSOR_WIDTH = 36.0  # mm, Blender's default
 # custom properties of a camera's data: the files of its photo, and of the photo's mask
 PHOTO, MASK = "refgs_photo", "refgs_mask"
+STROKES = (
+    "refgs_strokes"  # custom property of an image, a canvas for strokes that correct a mask: the file of its strokes
+)
 
 
 def read_cameras(path: Path, capture: Path | None) -> list[dict]:

@@ -3,45 +3,9 @@
 import bpy
 
 from .. import blend_paths, job_timers, preferences, properties
-from . import (
-    checked_capture,
-    closing,
-    decisions_box,
-    drop,
-    export_menu,
-    highlight,
-    hint_buttons,
-    icons,
-    light_panel,
-    many_panel,
-    materials_panel,
-    menus,
-    operators,
-    panels,
-    photo_buttons,
-    strokes_panel,
-    train_panel,
-    trainer_buttons,
-)
+from . import drop, export_menu, icons, light_panel, materials_panel, menus, operators, panels
 
-_MODULES = (
-    preferences,
-    properties,
-    blend_paths,
-    operators,
-    trainer_buttons,
-    icons,
-    checked_capture,
-    photo_buttons,
-    decisions_box,
-    train_panel,
-    strokes_panel,
-    closing,
-    many_panel,
-    panels,
-    highlight,
-    hint_buttons,
-)
+_MODULES = (preferences, properties, blend_paths, operators, icons, panels)
 _MODULES += (materials_panel, light_panel, export_menu, menus, drop)
 CLASSES = [cls for module in _MODULES for cls in getattr(module, "CLASSES", ())]
 
@@ -55,7 +19,6 @@ def register() -> None:
 
 
 def unregister() -> None:
-    preferences.forget_queries()
     job_timers.unregister()
     for module in reversed(_MODULES):
         if hasattr(module, "unregister"):

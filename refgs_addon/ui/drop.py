@@ -1,7 +1,4 @@
-"""Handle files that are dropped on the 3D view.
-
-A run.toml imports the run folder that it is in. A transforms.json makes its folder the capture to train on.
-"""
+"""Handle files that are dropped on the 3D view. A run.toml imports the run folder that it is in."""
 
 from pathlib import Path
 
@@ -9,12 +6,10 @@ import bpy
 from bpy.props import StringProperty
 
 from ..errors import InputError
-from ..preferences import set_up
-from ..scene import training
 from .operators import ReportsErrors, import_run_folder
 
 
-class _Drop(ReportsErrors):
+class Drop(ReportsErrors):
     """Store the path of a dropped file for the operators that handle it."""
 
     filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
@@ -29,7 +24,7 @@ class _Drop(ReportsErrors):
         return file.parent
 
 
-class DropRun(_Drop, bpy.types.Operator):
+class DropRun(Drop, bpy.types.Operator):
     bl_idname = "refgs.drop_run"
     bl_label = "Import RefGS Run"
     bl_description = "Import the run of this run.toml"
@@ -38,18 +33,7 @@ class DropRun(_Drop, bpy.types.Operator):
         import_run_folder(self, context, self.folder("run"))
 
 
-class DropCapture(_Drop, bpy.types.Operator):
-    bl_idname = "refgs.drop_capture"
-    bl_label = "Choose RefGS Capture"
-    bl_description = "Choose the capture of this transforms.json, and check it"
-
-    def work(self, context: bpy.types.Context) -> None:
-        context.scene.refgs.capture = str(self.folder("transforms"))
-        if set_up():
-            training.check(context.scene)
-
-
-class _OnView:
+class OnView:
     """Let file handlers accept only files that are dropped on the 3D view."""
 
     @classmethod
@@ -57,18 +41,11 @@ class _OnView:
         return context.area is not None and context.area.type == "VIEW_3D"
 
 
-class RunFile(_OnView, bpy.types.FileHandler):
+class RunFile(OnView, bpy.types.FileHandler):
     bl_idname = "REFGS_FH_run"
     bl_label = "RefGS Run"
     bl_import_operator = DropRun.bl_idname
     bl_file_extensions = ".toml"
 
 
-class CaptureFile(_OnView, bpy.types.FileHandler):
-    bl_idname = "REFGS_FH_capture"
-    bl_label = "RefGS Capture"
-    bl_import_operator = DropCapture.bl_idname
-    bl_file_extensions = ".json"
-
-
-CLASSES = (DropRun, DropCapture, RunFile, CaptureFile)
+CLASSES = (DropRun, RunFile)

@@ -8,14 +8,14 @@ from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
 from ..compat import NO_FBX, NO_USD, has_operator
-from ..scene import training
+from ..scene.apply_edits import apply_edits
 from ..scene.deleted_splats import count_deleted
 from ..scene.edit import edits, splats_of
 from ..scene.run_parts import FOLDER, active_run, folder_of, parts
-from .operators import ImportRun, ImportSplats, OnRun, has_trainer
+from .operators import ImportRun, ImportSplats, OnRun
 
 
-class _Export(OnRun, ExportHelper):
+class Export(OnRun, ExportHelper):
     """Export a part (`kind`, such as "mesh") of the active run to a chosen file.
 
     The button is disabled while there is a `problem`, and its tooltip says which.
@@ -65,7 +65,7 @@ class _Export(OnRun, ExportHelper):
         self.report({"INFO"}, f"Wrote {self.filepath}")
 
 
-class ExportSplats(_Export, bpy.types.Operator):
+class ExportSplats(Export, bpy.types.Operator):
     bl_idname = "refgs.export_splats"
     bl_label = "RefGS Splats (.ply)"
     bl_description = "Export the splats with their edited materials, for RefGS and for viewers of Gaussian splats"
@@ -73,53 +73,7 @@ class ExportSplats(_Export, bpy.types.Operator):
     kind, filename_ext = "splats", ".ply"
 
 
-class _ExportDisplaySplats(_Export):
-    bl_description = (
-        "Let the trainer make splats for viewers without lights, in the colours of the edited run "
-        "under the recovered light"
-    )
-
-    kind = "display splats"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return has_trainer(cls) and super().poll(context)
-
-    def work(self, context: bpy.types.Context) -> None:
-        file = Path(bpy.path.abspath(self.filepath))
-        training.export_display_splats(active_run(context), file)
-        self.report({"INFO"}, f"Making {file.name}: the Train panel shows the progress")
-
-
-class ExportDisplaySplats(_ExportDisplaySplats, bpy.types.Operator):
-    bl_idname = "refgs.export_display_splats"
-    bl_label = "RefGS Display Splats (.ply)"
-
-    filename_ext = ".ply"
-
-
-class ExportDisplaySplatsGltf(_ExportDisplaySplats, bpy.types.Operator):
-    bl_idname = "refgs.export_display_splats_gltf"
-    bl_label = "RefGS Display Splats (.glb)"
-
-    filename_ext = ".glb"
-
-
-class ExportDisplaySplatsSpz(_ExportDisplaySplats, bpy.types.Operator):
-    bl_idname = "refgs.export_display_splats_spz"
-    bl_label = "RefGS Display Splats (.spz)"
-
-    filename_ext = ".spz"
-
-
-class ExportDisplaySplatsUsd(_ExportDisplaySplats, bpy.types.Operator):
-    bl_idname = "refgs.export_display_splats_usd"
-    bl_label = "RefGS Display Splats (.usdc)"
-
-    filename_ext = ".usdc"
-
-
-class _ExportMesh(_Export):
+class _ExportMesh(Export):
     kind = "mesh"
 
     @classmethod
@@ -194,7 +148,7 @@ class ExportMeshFbx(_ExportMeshFor, bpy.types.Operator):
         return NO_FBX if not has_operator(bpy.ops.export_scene.fbx) else super().problem(run, folder)
 
 
-class ExportLight(_Export, bpy.types.Operator):
+class ExportLight(Export, bpy.types.Operator):
     bl_idname = "refgs.export_light"
     bl_label = "RefGS Recovered Light (.exr)"
     bl_description = "Export the light recovered from the photos as a panorama"
@@ -206,7 +160,7 @@ class ExportLight(_Export, bpy.types.Operator):
         return "" if (folder / "environment.exr").is_file() else "This run has no recovered light"
 
 
-class ApplyEdits(_Export, bpy.types.Operator):
+class ApplyEdits(Export, bpy.types.Operator):
     bl_idname = "refgs.apply_edits"
     bl_label = "Apply to New Run"
     bl_description = (
@@ -219,17 +173,14 @@ class ApplyEdits(_Export, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         out = Path(bpy.path.abspath(self.filepath))
-        job, made = training.apply_edits(context.scene, active_run(context), out), (out / "mesh.glb").exists()
+        job, made = apply_edits(context.scene, active_run(context), out), (out / "mesh.glb").exists()
         mesh = "" if made else "; set up the trainer in the preferences to make its mesh"
         self.report({"INFO"}, f"Wrote {out}" + ("; its mesh is being made" if job else mesh))
         if made:
             warn_of_deleted(self, active_run(context))
 
 
-FILES = (
-    *(ExportSplats, ExportDisplaySplats, ExportDisplaySplatsGltf, ExportDisplaySplatsSpz, ExportDisplaySplatsUsd),
-    *(ExportMesh, ExportMeshUsd, ExportMeshFbx, ExportLight),
-)
+FILES = (ExportSplats, ExportMesh, ExportMeshUsd, ExportMeshFbx, ExportLight)
 CLASSES = (*FILES, ApplyEdits)
 
 

@@ -22,11 +22,9 @@ from ..scene.material_presets import (
     save_material,
     set_material,
 )
-from ..scene.questions import KINDS, questions
 from ..scene.run_parts import active_run, parts
 from .export_menu import ApplyEdits
-from .hint_buttons import Hint
-from .icons import swatch, thumbnail
+from .icons import swatch
 from .operators import OnRun, ReportsErrors, select_only, show_materials
 from .panels import Tab
 
@@ -206,27 +204,12 @@ class MaterialPanel(Tab, bpy.types.Panel):
             if edits(splats):
                 layout.operator(ApplyEdits.bl_idname, icon="CHECKMARK")
 
-        row = layout.row(align=True)
-        metal = row.operator(Hint.bl_idname, text="This Part Is Metal")
-        paint = row.operator(Hint.bl_idname, text="This Part Is Paint")
-        metal.kind, paint.kind = KINDS
-        metal.question = paint.question = 0
-
     def _doubt(self, layout: bpy.types.UILayout, run: bpy.types.Collection, context: bpy.types.Context) -> None:
         width = letters(context)
         if words := doubt_words(run):
             wrapped_text(layout, words[0].upper() + words[1:], width, "QUESTION")
         on = doubt_shown(run)
         layout.operator(ShowDoubt.bl_idname, icon="HIDE_OFF" if on else "HIDE_ON", depress=on).on = not on
-        for number, question in enumerate(questions(run), 1):
-            box = layout.box()
-            box.label(text=f"Metal or paint? {question.part:.0%}, now {question.now}", icon="QUESTION")
-            if shown := thumbnail(question.picture, round(1e4 * question.part)):
-                box.template_icon(icon_value=shown, scale=8)
-            row = box.row(align=True)
-            for kind in KINDS:
-                button = row.operator(Hint.bl_idname, text=kind.capitalize(), depress=kind == question.now)
-                button.kind, button.question = kind, number
 
     def _edit(self, box: bpy.types.UILayout, edit: bpy.types.NodesModifier) -> None:
         row = box.row(align=True)

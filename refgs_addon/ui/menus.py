@@ -4,43 +4,14 @@ import bpy
 
 from ..nodes.edit_tree import REGIONS
 from ..nodes.splats_tree import NAME as SPLATS
-from ..scene.questions import KINDS
 from ..scene.run_parts import active_run, parts
-from . import (
-    export_menu,
-    hint_buttons,
-    light_panel,
-    many_panel,
-    materials_panel,
-    operators,
-    photo_buttons,
-    train_panel,
-)
+from . import export_menu, light_panel, materials_panel, operators
 
 
-def _buttons(layout: bpy.types.UILayout, *kinds: type[bpy.types.Operator]) -> None:
+def draw_buttons(layout: bpy.types.UILayout, *kinds: type[bpy.types.Operator]) -> None:
+    """Draw an entry for each operator."""
     for kind in kinds:
         layout.operator(kind.bl_idname)
-
-
-class TrainMenu(bpy.types.Menu):
-    bl_idname = "REFGS_MT_train"
-    bl_label = "Train"
-
-    def draw(self, context: bpy.types.Context) -> None:
-        _buttons(
-            self.layout,
-            photo_buttons.PhotosFromVideo,
-            train_panel.CheckCapture,
-            train_panel.FindCameras,
-            photo_buttons.MakeMasks,
-            photo_buttons.PaintStrokes,
-            photo_buttons.SaveStrokes,
-            train_panel.AddTrainingRegion,
-            train_panel.Train,
-            many_panel.TrainMany,
-            many_panel.ImportAsAssets,
-        )
 
 
 class RunMenu(bpy.types.Menu):
@@ -48,7 +19,7 @@ class RunMenu(bpy.types.Menu):
     bl_label = "Run"
 
     def draw(self, context: bpy.types.Context) -> None:
-        _buttons(self.layout, operators.ImportRun, operators.ImportSplats, export_menu.ApplyEdits)
+        draw_buttons(self.layout, operators.ImportRun, operators.ImportSplats, export_menu.ApplyEdits)
         run = active_run(context)
         for part in parts(run) if run else ():
             button = self.layout.operator(operators.ShowPart.bl_idname, text=f"Show {part.title()}")
@@ -67,9 +38,6 @@ class MaterialsMenu(bpy.types.Menu):
         for where in REGIONS:
             text = f"Edit Material: {where}"
             self.layout.operator(materials_panel.AddEdit.bl_idname, text=text).where = where
-        for kind in KINDS:
-            text = f"This Part Is {kind.capitalize()}"
-            self.layout.operator(hint_buttons.Hint.bl_idname, text=text).kind = kind
         self.layout.operator(materials_panel.ShowDoubt.bl_idname)
 
 
@@ -78,7 +46,7 @@ class LightMenu(bpy.types.Menu):
     bl_label = "Light"
 
     def draw(self, context: bpy.types.Context) -> None:
-        _buttons(self.layout, light_panel.Relight, light_panel.RecoveredLight, light_panel.MatchLight)
+        draw_buttons(self.layout, light_panel.Relight, light_panel.RecoveredLight, light_panel.MatchLight)
 
 
 class PreviewMenu(bpy.types.Menu):
@@ -86,7 +54,7 @@ class PreviewMenu(bpy.types.Menu):
     bl_label = "Preview"
 
     def draw(self, context: bpy.types.Context) -> None:
-        _buttons(
+        draw_buttons(
             self.layout,
             operators.NextCamera,
             operators.Photo,
@@ -102,7 +70,7 @@ class Menu(bpy.types.Menu):
     bl_label = "RefGS"
 
     def draw(self, context: bpy.types.Context) -> None:
-        for menu in (TrainMenu, RunMenu, MaterialsMenu, LightMenu, PreviewMenu):
+        for menu in (RunMenu, MaterialsMenu, LightMenu, PreviewMenu):
             self.layout.menu(menu.bl_idname)
         self.layout.operator(operators.OpenManual.bl_idname)
 
@@ -116,7 +84,7 @@ def _add_menu(self, context: bpy.types.Context) -> None:
     self.layout.operator(operators.ImportRun.bl_idname, text="RefGS Run…", icon="POINTCLOUD_DATA")
 
 
-CLASSES = (TrainMenu, RunMenu, MaterialsMenu, LightMenu, PreviewMenu, Menu)
+CLASSES = (RunMenu, MaterialsMenu, LightMenu, PreviewMenu, Menu)
 
 
 def register() -> None:

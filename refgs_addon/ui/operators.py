@@ -9,7 +9,7 @@ from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 from .. import jobs
 from ..errors import InputError, missing_module
-from ..preferences import hdri_folder, set_up
+from ..preferences import hdri_folder
 from ..scene.asset import mark_asset
 from ..scene.camera_objects import PHOTO, next_camera, photo_shown, show_photo
 from ..scene.capture_cameras import active_cameras
@@ -59,20 +59,6 @@ class OnJob(ReportsErrors):
         return jobs.find(self.serial)
 
 
-class OnCapture(ReportsErrors):
-    """Base class of operators on the scene's capture, the folder with the photos.
-
-    Their buttons are disabled while no folder is chosen or the trainer is not installed. The tooltip then says what to do.
-    """
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not has_trainer(cls):
-            return False
-        cls.poll_message_set("Choose the capture's folder first")
-        return bool(context.scene.refgs.capture)
-
-
 class OnRun(ReportsErrors):
     """Disable an operator's button, with the reason, while no run is imported."""
 
@@ -86,12 +72,6 @@ class OnRunFolder(ReportsErrors):
     """Store the folder of the listed run that an operator works on."""
 
     folder: StringProperty(name="Run Folder")
-
-
-def has_trainer(operator: type[bpy.types.Operator]) -> bool:
-    """Check whether a trainer is set up, and explain in the tooltip if not."""
-    operator.poll_message_set("Set up the trainer in the add-on's preferences first")
-    return set_up()
 
 
 def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path) -> None:
@@ -397,6 +377,18 @@ class ContactSheet(_Render, bpy.types.Operator):
             render_in_background(context.scene, png, lights, self.size, self.samples)
 
 
+class Dismiss(OnJob, bpy.types.Operator):
+    bl_idname = "refgs.put_away"
+    bl_label = "Dismiss"
+    bl_description = "Stop this job if it still runs; remove it from the list if it has ended"
+
+    def work(self, context: bpy.types.Context) -> None:
+        if self.job.ended:
+            jobs.JOBS.remove(self.job)
+        else:
+            self.job.stop()
+
+
 CLASSES = (
     ImportRun,
     ImportSplats,
@@ -411,4 +403,4 @@ CLASSES = (
     Photo,
     Turntable,
 )
-CLASSES += (RenderPreview, ContactSheet, MarkAsset)
+CLASSES += (RenderPreview, ContactSheet, Dismiss, MarkAsset)

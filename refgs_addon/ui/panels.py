@@ -4,7 +4,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import compat, jobs
+from .. import compat, hooks, jobs
 from ..nodes.splats_tree import NAME as MODIFIER
 from ..preferences import letters, wrapped_text
 from ..scene.camera_objects import photo_shown
@@ -33,6 +33,10 @@ class RunPanel(Tab, bpy.types.Panel):
         for collection in context.scene.collection.children:
             if found := parts(collection):
                 self._run(layout.box(), collection, found)
+        if not hooks.has_trainer():
+            row = layout.row()
+            row.label(text="The trainer is another extension")
+            row.operator(operators.OpenManual.bl_idname, text="", icon="HELP", emboss=False)
 
     def _run(self, layout: bpy.types.UILayout, collection: bpy.types.Collection, found: dict) -> None:
         row = layout.row()
@@ -116,7 +120,7 @@ class PreviewPanel(Tab, bpy.types.Panel):
     def _render(self, box: bpy.types.UILayout, job: jobs.Job, width: int) -> None:
         row = box.row()
         row.label(text=job.name, icon={"done": "CHECKMARK", "failed": "ERROR"}.get(job.state, "SORTTIME"))
-        row.operator("refgs.put_away", text="", icon="X", emboss=False).serial = job.serial
+        row.operator(operators.Dismiss.bl_idname, text="", icon="X", emboss=False).serial = job.serial
         if job.state == "done":
             png = job.results["render"]["png"]
             box.template_icon(icon_value=thumbnail(Path(png)), scale=10)

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from refgs_addon import installation, jobs
+from refgs_addon import jobs
+from refgs_addon.trainer import commands, installation
 from tests.makers.bring import bring
 from tests.makers.waiting import final_state, until
 
@@ -29,7 +30,7 @@ def home(tmp_path, monkeypatch):
 
 
 def install(home):
-    return jobs.install(home, home.parent / "logs" / "installation.txt")
+    return commands.install(home, home.parent / "logs" / "installation.txt")
 
 
 @pytest.fixture
@@ -77,7 +78,7 @@ def test_an_installation_to_its_end(home, monkeypatch):
     assert variables["UV_DEFAULT_INDEX"] == "mirror" and variables["UV_TORCH_BACKEND"] == "auto"
     assert variables["UV_PYTHON_PREFERENCE"] == "only-managed" and "PYTHONPATH" not in variables
     assert "torch==2.14.0" in job.log.read_text()
-    asked = jobs.query_trainer(installation.python(home), home.parent / "logs" / "trainer.txt")
+    asked = commands.query_trainer(installation.python(home), home.parent / "logs" / "trainer.txt")
     assert ended(asked)[0] == "done"
 
 
@@ -103,7 +104,7 @@ def test_progress_stopping_and_going_on(home, hanging, monkeypatch):
 
 
 def test_two_blenders_do_not_install_at_once(home, hanging):
-    for second in (install(home), jobs.remove(home, home.parent / "logs" / "removal.txt")):
+    for second in (install(home), commands.remove(home, home.parent / "logs" / "removal.txt")):
         state, line = ended(second)
         assert state == "failed" and line.startswith("another Blender installs or removes the trainer")
     assert not hanging.ended and (home / "cache" / "torch").exists()
@@ -161,9 +162,9 @@ def test_a_newer_release_goes_into_what_is_there(home, tmp_path, monkeypatch):
 
 def test_removing(home):
     ended(install(home))
-    job = jobs.remove(home, home.parent / "logs" / "installation.txt")
+    job = commands.remove(home, home.parent / "logs" / "installation.txt")
     assert ended(job)[0] == "done" and not home.exists() and not installation.installed(home)
-    assert ended(jobs.remove(home, job.log))[0] == "done"
+    assert ended(commands.remove(home, job.log))[0] == "done"
 
 
 def test_a_disk_that_is_too_full(home, monkeypatch):

@@ -10,6 +10,7 @@ import pytest
 
 from refgs_addon import jobs
 from refgs_addon.errors import InputError
+from refgs_addon.trainer import commands
 from tests.makers.waiting import final_state, until
 
 
@@ -18,8 +19,8 @@ def start(python, tmp_path):
     def start(name="good", out="run", mesh=True, **words):
         capture = tmp_path / f"{name} photos"
         capture.mkdir(exist_ok=True)
-        asked = jobs.Asked(capture, tmp_path / out, **words)
-        return jobs.train(python, asked, tmp_path / "logs" / f"{out}.txt", mesh)
+        asked = commands.Asked(capture, tmp_path / out, **words)
+        return commands.train(python, asked, tmp_path / "logs" / f"{out}.txt", mesh)
 
     return start
 
@@ -58,7 +59,7 @@ def test_one_that_is_silent_is_not_waited_for(tmp_path):
     """Check that `poll` returns at once for a job whose process still runs but has closed its output."""
     ends_with_its_input = "import os, sys; print('{}', flush=True); os.close(1); sys.stdin.read(); os._exit(3)"
     arguments, commands = ("-c", ends_with_its_input), [{"command": "rest"}]
-    job = jobs._add(jobs.Job("slow", Path(sys.executable), commands, tmp_path / "log.txt", arguments=arguments))
+    job = jobs.add(jobs.Job("slow", Path(sys.executable), commands, tmp_path / "log.txt", arguments=arguments))
     until(lambda: job._output_closed)
     assert not jobs.poll() and not job.ended and job._process.poll() is None
     job.close_input()
@@ -128,8 +129,9 @@ BLENDER = """
 import sys, time
 from pathlib import Path
 from refgs_addon import jobs
+from refgs_addon.trainer import commands
 python, capture, out, kept = sys.argv[1:]
-job = jobs.train(Path(python), jobs.Asked(Path(capture), Path(out)), Path(out + ".txt"), mesh=False)
+job = commands.train(Path(python), commands.Asked(Path(capture), Path(out)), Path(out + ".txt"), mesh=False)
 job.keep(kept == "kept")
 asked = False  # once: an answer to a second request may find Blender gone, and would end the trainer before its checkpoint
 while job.state != "paused":
@@ -224,29 +226,29 @@ def test_a_line_that_is_no_event(start):
 
 
 def test_a_python_that_is_not_there(start, tmp_path):
-    job = jobs.query_trainer(tmp_path / "nothing", tmp_path / "log.txt")
+    job = commands.query_trainer(tmp_path / "nothing", tmp_path / "log.txt")
     assert job.state == "failed" and "cannot be started" in job.line and "preferences" in job.line
 
 
 def test_a_python_without_the_trainer(tmp_path):
-    job = jobs.query_trainer(sys._base_executable, tmp_path / "log.txt")
+    job = commands.query_trainer(sys._base_executable, tmp_path / "log.txt")
     assert final_state(job) == "failed" and "log" in job.line
 
 
 def test_cameras_are_found_then_checked(python, tmp_path):
     capture = tmp_path / "bare photos"
     capture.mkdir()
-    checked = jobs.check(python, capture, tmp_path / "found", tmp_path / "check.txt")
+    checked = commands.check(python, capture, tmp_path / "found", tmp_path / "check.txt")
     assert final_state(checked) == "failed" and checked.no_cameras
-    found = jobs.find_cameras(python, capture, tmp_path / "found", tmp_path / "poses.txt")
+    found = commands.find_cameras(python, capture, tmp_path / "found", tmp_path / "poses.txt")
     assert final_state(found) == "done" and found.progress["stage"] == "matching" and not found.curve
     assert found.results["poses"]["placed"] == 3 and found.results["check"]["lines"][0] == "Views: 3"
 
 
 def test_asking_and_checking_run_beside_a_training(start, python, tmp_path):
     training = start()
-    asked = jobs.query_trainer(python, tmp_path / "log.txt")
-    checked = jobs.check(python, tmp_path, tmp_path / "found", tmp_path / "check.txt")
+    asked = commands.query_trainer(python, tmp_path / "log.txt")
+    checked = commands.check(python, tmp_path, tmp_path / "found", tmp_path / "check.txt")
     assert final_state(asked) == final_state(checked) == "done" and asked.ready["refgs"] == "9.9"
     assert checked.results["check"]["lines"] == ["Views: 3", "Warning: they are dark"]
     assert training.state != "waiting"

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from refgs_addon import installation, jobs
+from refgs_addon import jobs
+from refgs_addon.trainer import commands, installation
 from scripts.build_extension import write_locks
 from tests.makers.waiting import final_state
 
@@ -68,7 +69,7 @@ def release(tmp_path, monkeypatch):
 
 def install(home):
     """Install the release. Return how that ended, and its line."""
-    job = jobs.install(home, home.with_suffix(".log"))
+    job = commands.install(home, home.with_suffix(".log"))
     return final_state(job, seconds=200), job.line
 
 

@@ -33,20 +33,20 @@ def run(run_folder, scene):
 
 @pytest.fixture
 def addon(scene):
-    """Enable the add-on during the test, and return the empty scene."""
-    from refgs_addon import preferences, ui
+    """Enable the add-on with its trainer during the test, and return the empty scene."""
+    from tests.makers import extension
 
-    enabled = bpy.context.preferences.addons.new()
-    enabled.module = preferences.PACKAGE
-    ui.register()
+    entries = extension.list_in_preferences()
+    extension.enable()
     yield scene
-    ui.unregister()
-    bpy.context.preferences.addons.remove(enabled)
+    extension.disable()
+    for entry in entries:
+        bpy.context.preferences.addons.remove(entry)
 
 
 @pytest.fixture
 def fake_trainer(addon, python):
-    """Select the fake trainer in the add-on's preferences."""
-    from refgs_addon import preferences
+    """Select the fake trainer in the preferences."""
+    from refgs_addon.trainer import preferences
 
     preferences.preferences().python = str(python)

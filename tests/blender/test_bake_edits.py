@@ -11,13 +11,14 @@ from PIL import Image
 
 from refgs.color import srgb_decode, srgb_encode
 from refgs.formats.gltf import write_glb
-from refgs_addon import compat, jobs, preferences
+from refgs_addon import compat, jobs
 from refgs_addon.nodes.edit_tree import AMOUNT, COLOR, SURFACE
 from refgs_addon.scene.bake_edits import bake_edits
 from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.export_run import export_mesh, export_run
 from refgs_addon.scene.import_run import data_blocks, import_run
 from refgs_addon.scene.run_parts import show
+from refgs_addon.trainer import preferences
 from tests.makers.blender import attribute
 from tests.makers.box import SIZE, glb_chunks, textured_box
 from tests.makers.runs import random_columns, write_ply

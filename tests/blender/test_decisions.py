@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from refgs_addon.errors import InputError
-from refgs_addon.scene import decisions, training
-from refgs_addon.ui import decisions_box
+from refgs_addon.trainer.scene import decisions, training
+from refgs_addon.trainer.ui import decisions_box
 from tests.makers.waiting import until
 
 

@@ -106,7 +106,7 @@ def drawn(scene):
     layout.operator = lambda name, **options: buttons.setdefault(name, SimpleNamespace(**options))
     layout.box.return_value.label, layout.box.return_value.row.return_value.operator = layout.label, layout.operator
     context = Mock(scene=scene, view_layer=bpy.context.view_layer)
-    context.region.width, context.preferences.system.ui_scale = 600, 1
+    context.region.width, context.preferences.system.ui_scale, context.workspace.use_filter_by_owner = 600, 1, False
     MaterialPanel.draw(SimpleNamespace(layout=layout, _doubt=partial(MaterialPanel._doubt, None)), context)
     return [call.kwargs["text"] for call in layout.label.call_args_list], buttons
 

@@ -11,13 +11,13 @@ from mathutils import Matrix, Vector
 from refgs.train import hints as trained_again
 from refgs_addon import jobs
 from refgs_addon.errors import InputError
-from refgs_addon.scene import training
 from refgs_addon.scene.deleted_splats import add_points
 from refgs_addon.scene.edit import add_edit
-from refgs_addon.scene.hints import Surface, chosen_part, part_at
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.regions import REGION
-from refgs_addon.ui.hint_buttons import clicked_ray, confirmation
+from refgs_addon.trainer.scene import training
+from refgs_addon.trainer.scene.hints import Surface, chosen_part, part_at
+from refgs_addon.trainer.ui.hint_buttons import clicked_ray, confirmation
 from tests.makers.distances import spread
 from tests.makers.still_life import BALL, FAINT, SIDE, write_still_life
 from tests.makers.waiting import final_state, until

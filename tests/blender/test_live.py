@@ -5,7 +5,7 @@ import pytest
 
 from refgs_addon import jobs
 from refgs_addon.nodes.splats_tree import NAME
-from refgs_addon.scene import live_splats
+from refgs_addon.trainer.scene import live_splats
 from tests.makers.runs import random_columns, write_ply
 from tests.makers.waiting import until
 

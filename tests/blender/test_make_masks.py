@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from refgs_addon import jobs, preferences
+from refgs_addon import jobs
 from refgs_addon.errors import InputError
-from refgs_addon.scene import regions, strokes, training
 from refgs_addon.scene.capture_cameras import cameras_of, show_cameras
-from refgs_addon.ui.train_panel import status_words
+from refgs_addon.trainer import preferences
+from refgs_addon.trainer.scene import strokes, training, training_box
+from refgs_addon.trainer.ui.train_panel import status_words
 from tests.makers.waiting import final_state, until
 
 pytestmark = pytest.mark.usefixtures("fake_trainer")
@@ -100,16 +101,16 @@ def test_masks_show_the_box_among_the_cameras(addon, capture):
     assert final_state(job) == "done" and asked(capture) == {"settings": [], "model": None}
     assert [item.name for item in cameras_of(addon, capture).objects] == ["0", "1"]
     # The box is in the frame of the masked capture already, and has room.
-    box = regions.training_region(addon)
-    settings = regions.region_settings(addon)
+    box = training_box.training_region(addon)
+    settings = training_box.region_settings(addon)
     assert settings["region.centre"] == pytest.approx([1, 0, 0])
-    assert settings["region.size"] == pytest.approx([regions.ROOM * edge for edge in (1, 2, 4)])
+    assert settings["region.size"] == pytest.approx([training_box.ROOM * edge for edge in (1, 2, 4)])
     # As long as nobody touches it, it does not limit masks: strokes may add what is outside.
-    assert regions.artists_region(addon) is None
+    assert training_box.artists_region(addon) is None
     assert final_state(training.make_masks(addon)) == "done" and asked(capture) == {"settings": [], "model": None}
     assert sum("masks" in job.results for job in jobs.JOBS) == 1
     box.location = 1, 2, 3
-    assert regions.artists_region(addon) == box
+    assert training_box.artists_region(addon) == box
     preferences.preferences().mask_model = "/models/birefnet.onnx"
     assert final_state(training.make_masks(addon)) == "done"
     assert asked(capture)["model"] == "/models/birefnet.onnx"
@@ -117,7 +118,7 @@ def test_masks_show_the_box_among_the_cameras(addon, capture):
     assert [word.split("=")[0] for word in sent] == ["region.centre", "region.size", "region.rotation"]
     assert json.loads(sent[0].split("=")[1]) == [1, 2, 3]
     # The masks changed the frame, and the box with it.
-    assert regions.region_settings(addon)["region.centre"] == pytest.approx([2, 4, 7])
+    assert training_box.region_settings(addon)["region.centre"] == pytest.approx([2, 4, 7])
 
 
 def test_a_training_that_makes_masks_moves_the_frame(addon, tmp_path):
@@ -129,12 +130,12 @@ def test_a_training_that_makes_masks_moves_the_frame(addon, tmp_path):
     found = checked.results["check"]
     shown = show_cameras(addon, Path(found["capture"]), Path(found["cameras"]))
     before = [camera.location.copy() for camera in shown.objects]
-    box = regions.add_training_region(addon)
+    box = training_box.add_training_region(addon)
     box.location = 1, 2, 3
     job = training.train(addon)
     until(lambda: job.curve)
     assert job.decided["masks"] == "made 3 masks"
-    assert regions.region_settings(addon)["region.centre"] == pytest.approx([2, 4, 7])
+    assert training_box.region_settings(addon)["region.centre"] == pytest.approx([2, 4, 7])
     for old, camera in zip(before, shown.objects, strict=True):
         assert list(camera.location) == pytest.approx([2 * old[0], 2 * old[1], 2 * old[2] + 1])
     job.stop()

@@ -10,10 +10,12 @@ import bpy
 import pytest
 from filelock import FileLock
 
-from refgs_addon import jobs, preferences
+from refgs_addon import jobs
 from refgs_addon.errors import InputError
-from refgs_addon.scene import asset_library, batch_table, many
+from refgs_addon.scene import asset_library
 from refgs_addon.scene.run_parts import CAMERAS, parts
+from refgs_addon.trainer import preferences
+from refgs_addon.trainer.scene import batch_assets, batch_table, many
 from tests.makers.runs import write_run
 from tests.makers.training import TINY
 from tests.makers.waiting import final_state, until
@@ -136,7 +138,7 @@ def test_finished_runs_become_assets_of_a_library(finished):
     assert [Path(known.path) for known in libraries[before:]] == [library]
     assert {file.name for file in library.iterdir()} == {"blender_assets.cats.txt", "pot.blend"}
     assert f"{asset_library.CATALOG_ID}:RefGS:RefGS\n" in (library / "blender_assets.cats.txt").read_text()
-    assert [row.name for row in asset_library.missing_assets(finished)] == ["jar"]
+    assert [row.name for row in batch_assets.missing_assets(finished)] == ["jar"]
 
     with bpy.data.libraries.load(str(library / "pot.blend"), assets_only=True) as (found, wanted):
         wanted.collections = found.collections

@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 import pytest
 
-from refgs_addon import compat, ui
+from refgs_addon import compat
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit, edits
 from refgs_addon.scene.material_presets import (
@@ -20,6 +20,7 @@ from refgs_addon.scene.material_presets import (
 )
 from refgs_addon.ui.icons import BALL, ball
 from refgs_addon.ui.materials_panel import MaterialPresets
+from tests.makers import extension
 
 OURS = ["Brushed Steel", "Chrome", "Clay", "Copper", "Glazed Ceramic", "Gold", "Polished", "Rubber", "Silver"]
 
@@ -151,6 +152,6 @@ def test_the_buttons(addon, edit, own):
     with pytest.raises(RuntimeError, match="only those can be removed"):
         bpy.ops.refgs.keep_material(name="Gold", remove_name=True)
     assert list(materials()) == OURS
-    ui.unregister()
+    extension.disable()
     assert str(folder) not in bpy.utils.preset_paths("refgs_material")
-    ui.register()
+    extension.enable()

@@ -6,6 +6,7 @@ import bpy
 
 from refgs_addon import ui
 from refgs_addon.scene.import_run import import_run
+from refgs_addon.trainer import ui as trainer_ui
 from refgs_addon.ui import menus
 
 # Buttons of one row of a list: a job, a run, a decision, an edit, a brush. F3 has no row to give them.
@@ -27,15 +28,16 @@ def drawn(menu):
         return found[-1][1]
 
     def inner(name):
-        found.extend(drawn(next(other for other in menus.CLASSES if other.bl_idname == name)))
+        found.extend(drawn(getattr(bpy.types, name)))
 
-    menu.draw(SimpleNamespace(layout=SimpleNamespace(operator=operator, menu=inner)), bpy.context)
+    menu.draw(SimpleNamespace(layout=SimpleNamespace(operator=operator, menu=inner, operator_context="")), bpy.context)
     return found
 
 
 def test_the_menus_have_every_button(addon, run_folder):
     import_run(run_folder, addon)
-    names = {kind.bl_idname.removeprefix("refgs.") for kind in ui.CLASSES if issubclass(kind, bpy.types.Operator)}
+    kinds = [kind for kind in (*ui.CLASSES, *trainer_ui.CLASSES) if issubclass(kind, bpy.types.Operator)]
+    names = {kind.bl_idname.removeprefix("refgs.") for kind in kinds}
     exported = {name for name in names if name.startswith("export_")}  # File > Export has them
     assert {name for name, _ in drawn(menus.Menu)} == names - exported - OF_A_ROW - ELSEWHERE - PREFERENCES
 

@@ -5,8 +5,10 @@ import sys
 import bpy
 import pytest
 
-from refgs_addon import installation, jobs, preferences, ui
+from refgs_addon import jobs
 from refgs_addon.errors import InputError
+from refgs_addon.trainer import commands, installation, preferences
+from tests.makers import extension
 from tests.makers.bring import bring
 from tests.makers.waiting import final_state, until
 
@@ -71,7 +73,7 @@ def test_why_it_cannot_be_installed(online, python, monkeypatch, tmp_path):
     assert not poll() and "A Python is chosen" in preferences.installation_problem()
     preferences.preferences().python = ""
     (tmp_path / "photos").mkdir()
-    jobs.train(python, jobs.Asked(tmp_path / "photos", tmp_path / "run"), tmp_path / "log.txt")
+    commands.train(python, commands.Asked(tmp_path / "photos", tmp_path / "run"), tmp_path / "log.txt")
     assert not poll() and "trainer is running" in preferences.installation_problem()
     with pytest.raises(InputError, match="trainer is running"):
         preferences.remove()
@@ -84,6 +86,6 @@ def test_why_it_cannot_be_installed(online, python, monkeypatch, tmp_path):
 
 
 def test_taken_away_while_it_installs(hanging):
-    ui.unregister()
+    extension.disable()
     assert hanging._process.wait(timeout=20) == 1 and not installation.installed(preferences.home())
-    ui.register()
+    extension.enable()

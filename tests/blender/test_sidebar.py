@@ -8,18 +8,18 @@ from unittest.mock import Mock
 import blf
 import bpy
 
-from refgs_addon import jobs
+from refgs_addon import hooks, jobs
 from refgs_addon.nodes.edit_tree import REGIONS
-from refgs_addon.scene import training
 from refgs_addon.scene.deleted_splats import add_points
 from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.run_parts import show
+from refgs_addon.trainer.scene import training
+from refgs_addon.trainer.ui.many_panel import ManyPanel
+from refgs_addon.trainer.ui.train_panel import TrainPanel
 from refgs_addon.ui.light_panel import LightPanel
-from refgs_addon.ui.many_panel import ManyPanel
 from refgs_addon.ui.materials_panel import MaterialPanel
 from refgs_addon.ui.panels import PreviewPanel, RunPanel
-from refgs_addon.ui.train_panel import TrainPanel
 from tests.makers.still_life import add_mesh_light_and_photos, write_still_life
 from tests.makers.waiting import until
 
@@ -110,6 +110,7 @@ def drawn(panel):
         view_layer=context.view_layer,
         window_manager=context.window_manager,
         region=SimpleNamespace(width=SIDEBAR),
+        workspace=SimpleNamespace(use_filter_by_owner=False),
         preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0)),
     )
     methods = {name: value for name, value in vars(panel).items() if callable(value)}
@@ -125,6 +126,12 @@ def cut_texts():
 
 def test_no_text_of_an_empty_scene_is_cut(addon):
     assert cut_texts() == []
+
+
+def test_a_line_says_where_the_trainer_is(addon, monkeypatch):
+    assert "The trainer is another extension" not in texts(drawn(RunPanel))
+    monkeypatch.setattr(hooks, "mesh_maker", None)  # as without the trainer's extension
+    assert "The trainer is another extension" in texts(drawn(RunPanel)) and cut_texts() == []
 
 
 def test_no_text_of_a_run_is_cut(addon, fake_trainer, tmp_path):
@@ -177,11 +184,12 @@ def test_a_training_stays_above_reports(addon, fake_trainer, tmp_path):
 
 def names_drawn():
     """Return the names of the jobs in the panel Train, from top to bottom."""
-    texts = []
+    return [text for text in texts(drawn(TrainPanel)) if text in [job.name for job in jobs.JOBS]]
 
-    def collect(layout):
-        for item in layout.items:
-            collect(item) if isinstance(item, Layout) else texts.append(item[0])
 
-    collect(drawn(TrainPanel))
-    return [text for text in texts if text in [job.name for job in jobs.JOBS]]
+def texts(layout):
+    """List the texts of a layout, from top to bottom."""
+    found = []
+    for item in layout.items:
+        found += texts(item) if isinstance(item, Layout) else [item[0]]
+    return found

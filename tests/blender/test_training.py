@@ -13,16 +13,18 @@ import pytest
 from filelock import FileLock
 from scipy.spatial.transform import Rotation
 
-from refgs_addon import job_timers, jobs, preferences, ui
+from refgs_addon import jobs
 from refgs_addon.errors import InputError
 from refgs_addon.ply_file import read_rows
-from refgs_addon.scene import regions, training
 from refgs_addon.scene.camera_objects import photo_shown
 from refgs_addon.scene.capture_cameras import cameras_of
 from refgs_addon.scene.import_run import import_run
-from refgs_addon.ui import checked_capture, train_panel
-from refgs_addon.ui.closing import quit_question
-from refgs_addon.ui.icons import CURVE, DOTS, GRID, LINE, plot
+from refgs_addon.trainer import commands, preferences, timers
+from refgs_addon.trainer.scene import training, training_box
+from refgs_addon.trainer.ui import checked_capture, train_panel
+from refgs_addon.trainer.ui.closing import quit_question
+from refgs_addon.trainer.ui.job_icons import CURVE, DOTS, GRID, LINE, plot
+from tests.makers import extension
 from tests.makers.captures import edit
 from tests.makers.waiting import final_state, until
 
@@ -263,7 +265,7 @@ def test_photos_without_cameras(addon, tmp_path):
 
 
 def test_the_bar_shows_how_much_of_the_mesh_is_made(addon, capture, run_folder):
-    for job in (training.train(addon), jobs.export(preferences.python(), run_folder, run_folder / "log")):
+    for job in (training.train(addon), commands.export(preferences.python(), run_folder, run_folder / "log")):
         assert final_state(job) == "failed"  # as the fake does, after 40 % of the mesh
         assert (train_panel.fraction(job), train_panel.status_words(job)) == (0.4, "making the mesh, 40%")
 
@@ -297,9 +299,9 @@ def test_taken_away_while_it_trains(addon, capture):
     training.train(addon)
     job = jobs.JOBS[-1]
     until(lambda: job.progress)
-    ui.unregister()
+    extension.disable()
     assert job._process.wait(timeout=20) == 0 and not jobs.JOBS
-    ui.register()
+    extension.enable()
 
 
 def settings_sent(out):
@@ -355,27 +357,27 @@ def test_a_hidden_box_is_the_same_when_the_file_is_opened_again(addon, capture, 
     bpy.ops.refgs.add_training_region()
     addon.refgs.region.location = 1, 2, 3
     addon.refgs.region.hide_viewport = True
-    before = regions.region_settings(addon)
+    before = training_box.region_settings(addon)
     assert before["region.centre"] == [1, 2, 3] and addon.refgs.region.hide_viewport
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    assert regions.region_settings(bpy.context.scene) == before
+    assert training_box.region_settings(bpy.context.scene) == before
 
 
 def test_a_box_that_is_deleted_or_cleared_is_no_region(addon, capture):
     bpy.ops.refgs.add_training_region()
     box = addon.refgs.region
     bpy.ops.object.delete()  # the settings still refer to it
-    assert regions.training_region(addon) is None and regions.region_settings(addon) == {}
+    assert training_box.training_region(addon) is None and training_box.region_settings(addon) == {}
     bpy.ops.refgs.add_training_region()
-    assert addon.refgs.region != box and regions.region_settings(addon)
+    assert addon.refgs.region != box and training_box.region_settings(addon)
     addon.refgs.region = None
-    assert regions.region_settings(addon) == {}
+    assert training_box.region_settings(addon) == {}
 
 
 def test_the_box_holds_what_the_cameras_look_at(addon, checked, capture):
     checked.results["check"] |= {"capture": str(capture.resolve()), "centre": [1.0, 2.0, 3.0], "radius": 4.0}
-    box = regions.add_training_region(addon)
+    box = training_box.add_training_region(addon)
     assert list(box.location) == [1, 2, 3] and list(box.scale) == [4, 4, 4]
 
 
@@ -393,10 +395,10 @@ def test_closing_asks_only_while_something_trains(addon, capture):
     second.stop()
     assert quit_question() == "A training is running"
     # Blender disables its add-ons when it closes: kept jobs continue.
-    ui.unregister()
+    extension.disable()
     assert not jobs.JOBS and first._process.wait(timeout=20) == 0
     assert jobs.run_state(first.run) == "finished" and not second.run.exists()
-    ui.register()
+    extension.enable()
 
 
 def test_a_run_that_another_process_trains(addon, capture, tmp_path):
@@ -407,7 +409,7 @@ def test_a_run_that_another_process_trains(addon, capture, tmp_path):
     run = job.run
     jobs.JOBS.clear()
     with FileLock(run / "run.lock"):
-        assert jobs.run_state(run) == "training" and job_timers._poll_other_processes() == job_timers.OTHER_SECONDS
+        assert jobs.run_state(run) == "training" and timers._poll_other_processes() == timers.OTHER_SECONDS
         (run / "progress.json").write_text('{"iteration": 250, "total": 1000, "seconds_left": 190.0}')
         assert train_panel.other_process_status(run) == (0.25, "25%, 3:10 left")
         with pytest.raises(InputError, match="is being trained already"):
@@ -417,7 +419,7 @@ def test_a_run_that_another_process_trains(addon, capture, tmp_path):
         (run / "progress.json").unlink()
         (run / "splats.ply").touch()
         assert train_panel.other_process_status(run)[1] == "Making the mesh"
-    assert jobs.run_state(run) == "finished" and job_timers._poll_other_processes() is None
+    assert jobs.run_state(run) == "finished" and timers._poll_other_processes() is None
     with pytest.raises(RuntimeError, match="is not being trained"):
         bpy.ops.refgs.stop_run(folder=str(run))
 
@@ -428,15 +430,19 @@ def test_the_guessed_box_is_among_the_cameras(addon, checked, capture):
     bpy.ops.refgs.show_cameras(serial=checked.serial)
     box = addon.refgs.region
     assert tuple(box.location) == (0, 0, 1) and tuple(box.scale) == (2.5, 2.5, 2.5)
-    assert regions.artists_region(addon) is None and regions.region_settings(addon) == {}
+    assert training_box.artists_region(addon) is None and training_box.region_settings(addon) == {}
     box.location.x = 1
-    assert regions.artists_region(addon) == box and regions.region_settings(addon)["region.centre"] == [1, 0, 1]
+    assert training_box.artists_region(addon) == box and training_box.region_settings(addon)["region.centre"] == [
+        1,
+        0,
+        1,
+    ]
     bpy.ops.refgs.show_cameras(serial=checked.serial)
     assert addon.refgs.region == box, "the artist's box stays"
     box.location.x = 0
     for _ in range(2):
         bpy.ops.refgs.show_cameras(serial=checked.serial)
-    assert regions.training_region(addon) is None, "an untouched guess goes with the cameras"
+    assert training_box.training_region(addon) is None, "an untouched guess goes with the cameras"
     bpy.ops.refgs.show_cameras(serial=checked.serial)
     bpy.ops.refgs.add_training_region()
-    assert regions.artists_region(addon) == addon.refgs.region
+    assert training_box.artists_region(addon) == addon.refgs.region

@@ -5,7 +5,6 @@ Arguments: the Python with the trainer, and the run folder. stage.py shows the c
 
 import bpy
 from stage import (
-    MODULE,
     WORDS,
     act,
     addon,
@@ -16,10 +15,12 @@ from stage import (
     hover,
     install,
     jobs,
+    panels,
     photograph,
     press,
     region,
     report,
+    set_python,
     view,
 )
 
@@ -47,8 +48,8 @@ def artist():
 
 def choose_light():
     """Click on the light's picture, then on a picture in the menu that opens below it."""
-    panels = [cls for cls in addon("ui").CLASSES if issubclass(cls, bpy.types.Panel)]
-    for cls in panels:
+    registered = panels()
+    for cls in registered:
         if cls.__name__ != "LightPanel":  # the only panel's place in the sidebar is known
             bpy.utils.unregister_class(cls)
     area().tag_redraw()
@@ -63,7 +64,7 @@ def choose_light():
     photograph("lit")
     report["light"] = bpy.context.scene.world.node_tree.nodes["RefGS HDRI"].image.filepath
     bpy.ops.refgs.recovered_light()
-    for cls in panels:
+    for cls in registered:
         if cls.__name__ != "LightPanel":
             bpy.utils.register_class(cls)
 
@@ -121,12 +122,12 @@ def paint():
 
 def hint():
     """Say that the ball is metal. Cancel before the click, then the dialogue, then train; then answer a question, and cancel."""
-    bpy.context.preferences.addons[MODULE].preferences.python = PYTHON
+    set_python(PYTHON)
     bpy.context.scene.refgs.mesh = False
     bpy.context.view_layer.objects.active = bpy.data.objects["still mesh"]
     shown = region("WINDOW")
     ball = shown.x + shown.width // 2, shown.y + shown.height // 2
-    report["begun"], highlighted = {}, addon("ui.highlight")
+    report["begun"], highlighted = {}, addon("trainer.ui.highlight")
 
     def count(step):
         begun = sum(job.run is not None for job in jobs())

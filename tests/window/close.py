@@ -4,7 +4,7 @@ Arguments: the Python with the trainer, the capture, and the letter key that ans
 """
 
 import bpy
-from stage import MODULE, OUT, WORDS, act, install, jobs, photograph, press, report, write_report
+from stage import OUT, WORDS, act, install, jobs, photograph, press, report, set_python, write_report
 
 PYTHON, CAPTURE, LETTER = WORDS
 
@@ -20,7 +20,7 @@ def artist():
     Each `yield` gives a function; the next step waits until this function returns true.
     """
     install()
-    bpy.context.preferences.addons[MODULE].preferences.python = PYTHON
+    set_python(PYTHON)
     settings = bpy.context.scene.refgs
     settings.capture, settings.preset, settings.limited, settings.minutes = CAPTURE, "quick", True, 1.5
     yield lambda: True

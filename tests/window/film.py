@@ -7,7 +7,7 @@ import importlib.util
 from pathlib import Path
 
 import bpy
-from stage import MODULE, WORDS, act, after, area, choose_tab, install, jobs, photograph, report, view
+from stage import WORDS, act, after, area, choose_tab, install, jobs, photograph, report, set_python, view
 
 PYTHON, FILM = WORDS
 
@@ -46,7 +46,7 @@ def artist():
     install()
     area().spaces.active.show_region_ui = True
     bpy.data.objects.remove(bpy.data.objects["Cube"])
-    bpy.context.preferences.addons[MODULE].preferences.python = PYTHON
+    set_python(PYTHON)
     settings = bpy.context.scene.refgs
     yield after(1.0)
     choose_tab()

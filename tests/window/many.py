@@ -7,7 +7,7 @@ import importlib.util
 import sys
 
 import bpy
-from stage import MODULE, WORDS, act, after, area, choose_tab, install, jobs, photograph, report
+from stage import MODULE, WORDS, act, after, area, choose_tab, install, jobs, photograph, report, set_python
 
 PYTHON, CAPTURES, RESULTS = WORDS
 
@@ -28,7 +28,7 @@ def artist():
     area().spaces.active.show_region_ui = True
     yield after(1.0)
     choose_tab()
-    bpy.context.preferences.addons[MODULE].preferences.python = PYTHON
+    set_python(PYTHON)
     settings = bpy.context.scene.refgs.many
     settings.captures, settings.results = CAPTURES, RESULTS
     yield lambda: all(job.ended for job in jobs())
@@ -58,7 +58,7 @@ def artist():
 
 def open_panel():
     """Let the panel Train Many be open when it is drawn first: a script cannot click on its title."""
-    panel = sys.modules[f"{MODULE}.refgs_addon.ui.many_panel"].ManyPanel
+    panel = sys.modules[f"{MODULE}.refgs_addon.trainer.ui.many_panel"].ManyPanel
     bpy.utils.unregister_class(panel)
     panel.bl_options = set()
     bpy.utils.register_class(panel)

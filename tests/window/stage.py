@@ -1,6 +1,8 @@
-"""Provide functions for the scripts that run in a Blender window: install the extension, take screenshots, write a report.
+"""Provide functions for the scripts that run in a Blender window: install the extensions, take screenshots, write a report.
 
-blender --python-expr "import sys; sys.path.append(FOLDER)" --python SCRIPT.py -- EXTENSION.zip [ARGUMENT ...] OUT
+blender --python-expr "import sys; sys.path.append(FOLDER)" --python SCRIPT.py -- REPOSITORY [ARGUMENT ...] OUT
+
+REPOSITORY is a folder with the extensions' zips and the index.json that Blender generated of them.
 """
 
 import importlib
@@ -14,21 +16,42 @@ from pathlib import Path
 
 import bpy
 
-ARCHIVE, *WORDS, OUT = sys.argv[sys.argv.index("--") + 1 :]
+REPOSITORY, *WORDS, OUT = sys.argv[sys.argv.index("--") + 1 :]
 OUT = Path(OUT)
-MODULE = "bl_ext.user_default.refgs"
+MODULE, TRAINER = "bl_ext.refgs_host.refgs", "bl_ext.refgs_host.refgs_trainer"
 PATIENCE = 180  # seconds, for a machine that is busy
 bpy.context.preferences.view.show_splash = False
 report = {}
 
 
-def install():
-    bpy.ops.extensions.package_install_files(filepath=ARCHIVE, repo="user_default", enable_on_install=True)
+def install(*names):
+    """Install extensions from the repository, as an artist does who has added it in the preferences. By default, both."""
+    repositories = bpy.context.preferences.extensions.repos
+    if "refgs_host" not in [repository.module for repository in repositories]:
+        repositories.new(name="RefGS", module="refgs_host", remote_url=Path(REPOSITORY, "index.json").as_uri())
+    number = [repository.module for repository in repositories].index("refgs_host")
+    system = bpy.context.preferences.system
+    system.use_online_access = True  # Blender asks for it even where the repository is a folder
+    bpy.ops.extensions.repo_sync(repo_index=number)
+    for name in names or ("refgs", "refgs_trainer"):
+        bpy.ops.extensions.package_install(repo_index=number, pkg_id=name, enable_on_install=True)
+    system.use_online_access = False
+
+
+def set_python(file):
+    """Choose the Python that has the trainer."""
+    bpy.context.preferences.addons[TRAINER].preferences.python = str(file)
 
 
 def addon(name):
     """Return a module of the add-on, such as "scene.hints"."""
     return importlib.import_module(f"{MODULE}.refgs_addon.{name}")
+
+
+def panels():
+    """List the panels of both extensions."""
+    classes = [*addon("ui").CLASSES, *addon("trainer.ui").CLASSES]
+    return [cls for cls in classes if issubclass(cls, bpy.types.Panel)]
 
 
 def jobs():

@@ -18,9 +18,10 @@ import cv2
 import numpy as np
 import pytest
 
+from refgs.formats.gltf import write_glb
 from refgs_addon import jobs
+from tests.makers.box import textured_box
 from tests.makers.films import film_ball
-from tests.makers.runs import write_run
 from tests.makers.still_life import PHOTOS, add_mesh_light_and_photos, write_still_life
 from tests.makers.training import TINY
 
@@ -57,18 +58,19 @@ def golden(file):
 
 
 def in_window(script, tmp_path, *words):
-    """Build the extension, and run a script with it in a Blender window. Returns the script's report.
+    """Build the extensions and a repository with them, and run a script with it in a Blender window. Returns the script's report.
 
     `words` are further arguments of the script.
     """
     command = blender_command()
     bpy = pytest.importorskip("bpy", reason="the extension is built with the tool in Blender's Python module")
     tool = Path(bpy.utils.resource_path("LOCAL"), "scripts", "addons_core", "bl_pkg", "cli", "blender_ext.py")
-    archive = tmp_path / "refgs.zip"
-    subprocess.run([sys.executable, tool, "build", "--source-dir", ROOT, "--output-filepath", archive], check=True)
+    repository = tmp_path / "repository"
+    subprocess.run([sys.executable, ROOT / "scripts" / "build_extension.py", repository, "--bare"], check=True)
+    subprocess.run([sys.executable, tool, "server-generate", "--repo-dir", repository], check=True)
     folder = Path(__file__).parent
     beside = ["--python-expr", f"import sys; sys.path.append({str(folder)!r})", "--python", folder / script]
-    words = [*command, "--enable-event-simulate", *beside, "--", archive, *words, tmp_path]
+    words = [*command, "--enable-event-simulate", *beside, "--", repository, *words, tmp_path]
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
     done = subprocess.run(list(map(str, words)), env=environment, capture_output=True, text=True, timeout=1200)
     path = tmp_path / "report.json"
@@ -80,16 +82,24 @@ def in_window(script, tmp_path, *words):
 
 @pytest.mark.window
 def test_the_tab_shows_in_a_window(tmp_path):
-    report = in_window("drive.py", tmp_path, write_run(tmp_path / "pot"))
-    assert report["enabled"]
-    assert report["drawn"] == [f"REFGS_PT_{name}" for name in ("light", "materials", "preview", "run", "train")]
+    run = write_still_life(tmp_path / "still")
+    add_mesh_light_and_photos(run)
+    write_glb(run / "mesh.glb", *textured_box())
+    report = in_window("drive.py", tmp_path, run)
+    assert report["enabled"] == [True, False]
+    assert report["drawn"] == [f"REFGS_PT_{name}" for name in ("light", "materials", "preview", "run")]
+    assert "REFGS_PT_train" in report["drawn with the trainer"]
     if report["numpy"]:
         assert report["import"] == ["FINISHED"]
+        for name in ("splats.ply", "mesh.glb", "light.exr", "preview.png"):
+            assert (tmp_path / name).stat().st_size > 0
+        assert "mesh.glb" in report["wrote"] and report["render"] == ["done", ""]
     else:
         assert "Blender's Python lacks numpy" in report["import"]
-    assert report["left"] == []
-    picture = cv2.imread(str(tmp_path / "window.png"))
-    assert picture.shape[0] > 500 and picture.shape[1] > 800 and picture.std() > 5
+    assert report["trainer alone"] == ["REFGS_PT_no_trainer"] and report["enabled again"] and report["left"] == []
+    for name in ("alone", "both", "trainer alone"):
+        picture = cv2.imread(str(tmp_path / f"{name}.png"))
+        assert picture.shape[0] > 500 and picture.shape[1] > 800 and picture.std() > 5
 
 
 @pytest.mark.window

@@ -10,7 +10,6 @@ import traceback
 
 import bpy
 from stage import (
-    MODULE,
     OUT,
     PATIENCE,
     WORDS,
@@ -20,11 +19,13 @@ from stage import (
     click,
     install,
     jobs,
+    panels,
     photograph,
     press,
     quit_blender,
     region,
     report,
+    set_python,
     view,
 )
 
@@ -53,7 +54,7 @@ def artist():
     choose_tab()
     yield lambda: True, "empty"
     measure_addon()
-    bpy.context.preferences.addons[MODULE].preferences.python = PYTHON
+    set_python(PYTHON)
     settings = bpy.context.scene.refgs
     settings.capture, settings.preset, settings.limited, settings.minutes = CAPTURE, "quick", True, 2.0
     yield last("done"), None
@@ -157,9 +158,8 @@ def measure_addon():
             return look()
 
     timers._poll_jobs = measured_look
-    for cls in addon("ui").CLASSES:
-        if issubclass(cls, bpy.types.Panel):
-            cls.draw = measured_draw(cls.draw)
+    for cls in panels():
+        cls.draw = measured_draw(cls.draw)
 
 
 def measured_draw(draw):

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import bpy
 
-from ..errors import InputError
-from ..json_file import read_json
+from ...errors import InputError
+from ...json_file import read_json
 
 ON_OFF = ("on", "off")  # words of the trainer's settings [needs]
 

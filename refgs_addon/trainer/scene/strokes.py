@@ -11,18 +11,15 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ..errors import InputError
-from ..ordinary import check_file, open_file
-from .atomic_file import atomic_write
-from .camera_objects import MASK, PHOTO
+from ...errors import InputError
+from ...ordinary import check_file, open_file
+from ...scene.atomic_file import atomic_write
+from ...scene.camera_objects import MASK, PHOTO, STROKES
 
 if TYPE_CHECKING:
     import numpy as np
 
-CAPTURE, STROKES = (
-    "refgs_capture",
-    "refgs_strokes",
-)  # custom properties of a canvas: the capture's folder, the file of its strokes
+CAPTURE = "refgs_capture"  # custom property of a canvas: the capture's folder
 LONGEST = 1600  # pixels of a canvas on its longer side
 DARKEST, BRIGHTEST = 0.2, 0.8  # of the photo on a canvas
 BLACK, WHITE = 0.1, 0.9  # limits of what counts as a stroke

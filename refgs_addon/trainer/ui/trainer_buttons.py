@@ -4,8 +4,8 @@ from typing import ClassVar
 
 import bpy
 
+from ...ui.operators import ReportsErrors
 from .. import preferences
-from .operators import ReportsErrors
 
 
 class QueryTrainer(ReportsErrors, bpy.types.Operator):

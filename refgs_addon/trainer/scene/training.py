@@ -7,16 +7,19 @@ from typing import TYPE_CHECKING, NamedTuple
 import bpy
 from mathutils import Matrix, Vector
 
-from .. import jobs
-from ..errors import InputError
-from ..job_timers import follow_jobs
-from ..json_file import read_json
-from ..preferences import capture_folder, hints_file, log_file, mask_model, python, set_up
+from ... import jobs
+from ...errors import InputError
+from ...job_timers import follow_jobs
+from ...json_file import read_json
+from ...preferences import log_file
+from ...scene.apply_edits import remember
+from ...scene.capture_cameras import cameras_of, show_cameras
+from ...scene.run_toml import capture_of
+from .. import commands
+from ..preferences import capture_folder, hints_file, mask_model, python
 from . import strokes
-from .capture_cameras import cameras_of, show_cameras
 from .decisions import find_decision
-from .regions import artists_region, region_settings, show_found_region
-from .run_toml import capture_of
+from .training_box import artists_region, region_settings, show_found_region
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,7 +35,7 @@ def check(scene: bpy.types.Scene) -> jobs.Job:
     The job's `results["check"]` is the report. Raises InputError if there is no trainer or no capture.
     """
     capture = _capture(scene)
-    job = jobs.check(python(), capture, capture_folder(capture), log_file(f"check {capture.name}"))
+    job = commands.check(python(), capture, capture_folder(capture), log_file(f"check {capture.name}"))
     follow_jobs()
     return job
 
@@ -44,7 +47,7 @@ def find_cameras(scene: bpy.types.Scene) -> jobs.Job:
     or no capture.
     """
     capture = _capture(scene)
-    job = jobs.find_cameras(python(), capture, capture_folder(capture), log_file(f"cameras {capture.name}"))
+    job = commands.find_cameras(python(), capture, capture_folder(capture), log_file(f"cameras {capture.name}"))
     jobs.JOBS[:] = [known for known in jobs.JOBS if not known.no_cameras]
     follow_jobs()
     return job
@@ -60,7 +63,7 @@ def extract_photos(scene: bpy.types.Scene, video: Path, out: Path | None, count:
     if out is None:
         coming = {Path(job.commands[0]["out"]) for job in jobs.JOBS if job.commands and "video" in job.commands[0]}
         out = _free(video.with_suffix(""), coming)
-    job = jobs.extract_photos(python(), video, out, count, log_file(f"frames {out.name}"))
+    job = commands.extract_photos(python(), video, out, count, log_file(f"frames {out.name}"))
     number = scene.session_uid
 
     def choose(job: jobs.Job) -> None:
@@ -85,7 +88,7 @@ def make_masks(scene: bpy.types.Scene) -> jobs.Job:
     settings = region_settings(scene) if mine else {}
     settings.pop("region.up", None)  # turns the frame of a training, not that of the cameras
     log = log_file(f"masks {capture.name}")
-    job = jobs.make_masks(python(), capture, capture_folder(capture), log, settings, mask_model())
+    job = commands.make_masks(python(), capture, capture_folder(capture), log, settings, mask_model())
     jobs.JOBS[:] = [other for other in jobs.JOBS if other is job or not (other.ended and "masks" in other.results)]
     number = scene.session_uid
 
@@ -151,7 +154,7 @@ class HintPlan(NamedTuple):
 
 def plan_hint(scene: bpy.types.Scene, collection: bpy.types.Collection) -> HintPlan:
     """Return what a training with a hint about a run would do. Raises InputError if the run's checkpoint or its capture is missing."""
-    from .export_run import run_folder
+    from ...scene.export_run import run_folder
 
     folder = run_folder(collection)
     if not any((folder / "checkpoints").glob("*.toml")):
@@ -181,7 +184,7 @@ def train_with_hint(
     goes into a new folder beside the run. Raises InputError if one of these is missing: the trainer, the part, the run's checkpoint or its
     capture.
     """
-    from .edit import splats_of
+    from ...scene.edit import splats_of
     from .hints import chosen_part, part_at, write_hint
 
     trainer, plan = python(), plan_hint(scene, collection)
@@ -194,9 +197,9 @@ def train_with_hint(
         points = part_at(splats, *ray)
     file = hints_file(plan.out)
     write_hint(file, kind, points)
-    asked = jobs.Asked(plan.capture, plan.out, hinted=(plan.folder, file))
-    job = jobs.train(trainer, asked, log_file(plan.out.name), scene.refgs.mesh)
-    _remember(scene, plan.out, plan.capture)
+    asked = commands.Asked(plan.capture, plan.out, hinted=(plan.folder, file))
+    job = commands.train(trainer, asked, log_file(plan.out.name), scene.refgs.mesh)
+    remember(scene, plan.out, plan.capture)
     follow_jobs()
     return job
 
@@ -215,8 +218,8 @@ def _train(scene: bpy.types.Scene, out: Path, changes: dict[str, object]) -> job
     """Start a training into `out` with the scene's settings and `changes` of the trainer's settings."""
     settings, capture = scene.refgs, _capture(scene)
     preset, minutes = (None, settings.minutes) if settings.limited else (settings.preset, None)
-    asked = jobs.Asked(capture, out, preset, minutes, region_settings(scene) | _choices(settings) | changes)
-    job = jobs.train(python(), asked, log_file(out.name), settings.mesh)
+    asked = commands.Asked(capture, out, preset, minutes, region_settings(scene) | _choices(settings) | changes)
+    job = commands.train(python(), asked, log_file(out.name), settings.mesh)
     number = scene.session_uid
 
     def masked(found: dict) -> None:
@@ -226,24 +229,14 @@ def _train(scene: bpy.types.Scene, out: Path, changes: dict[str, object]) -> job
                 camera.location = Matrix(found["moved"]) @ camera.location
 
     job.masked = masked
-    _remember(scene, out, capture)
+    remember(scene, out, capture)
     follow_jobs()
     return job
 
 
-def apply_edits(scene: bpy.types.Scene, collection: bpy.types.Collection, out: Path) -> jobs.Job | None:
-    """Write a run with its edits as a new run folder, and add the folder to the scene's list.
-
-    If a trainer is set up, a job makes the mesh and textures, unless the new folder has those of the unedited run. Without a trainer, the
-    edits are baked into the run's mesh here. Returns the job, or None. Raises InputError where the run cannot be exported.
-    """
-    from .export_run import export_run
-
-    export_run(collection, out, bake=not set_up())
-    _remember(scene, out)
-    if (out / "mesh.glb").exists() or not set_up():
-        return None
-    job = jobs.export(python(), out, log_file(out.name))
+def make_mesh(run: Path) -> jobs.Job:
+    """Start a job that makes the mesh and textures of a run folder. Raises InputError if there is no trainer."""
+    job = commands.export(python(), run, log_file(run.name))
     follow_jobs()
     return job
 
@@ -254,8 +247,8 @@ def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.
     Display splats have fixed colours: how the run looks under the light recovered from the photos. An existing file is replaced. Raises
     InputError if the trainer, the run folder or the folder for the file is missing.
     """
-    from .edit import is_edited, splats_of
-    from .export_run import export_run, run_folder
+    from ...scene.edit import is_edited, splats_of
+    from ...scene.export_run import export_run, run_folder
 
     trainer, folder = python(), run_folder(collection)
     if not file.parent.is_dir():
@@ -264,7 +257,7 @@ def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.
         edited = Path(tempfile.mkdtemp(dir=bpy.app.tempdir), folder.name)  # Blender deletes tempdir when it ends
         export_run(collection, edited, bake=False)
         folder = edited
-    job = jobs.display_splats(trainer, folder, file, log_file(f"export {file.stem}"))
+    job = commands.display_splats(trainer, folder, file, log_file(f"export {file.stem}"))
     follow_jobs()
     return job
 
@@ -277,8 +270,8 @@ def resume(scene: bpy.types.Scene, folder: Path) -> jobs.Job:
         raise InputError(f"{folder} is being trained already by another process: stop that or wait for it")
     if known is None or state != "stopped":
         raise InputError(f"{folder} has no stopped training to resume: start a new one")
-    asked = jobs.Asked(Path(known.capture), folder, resume=True)
-    job = jobs.train(python(), asked, log_file(folder.name), scene.refgs.mesh)
+    asked = commands.Asked(Path(known.capture), folder, resume=True)
+    job = commands.train(python(), asked, log_file(folder.name), scene.refgs.mesh)
     follow_jobs()
     return job
 
@@ -302,12 +295,6 @@ def _choices(settings: bpy.types.PropertyGroup) -> dict[str, object]:
         "needs.reflections": settings.reflections,
     }
     return {name: value for name, value in chosen.items() if value != "auto"}
-
-
-def _remember(scene: bpy.types.Scene, run: Path, capture: Path | None = None) -> None:
-    if all(Path(known.folder) != run for known in scene.refgs.runs):
-        known = scene.refgs.runs.add()
-        known.folder, known.capture = str(run), str(capture or "")
 
 
 def _trained_capture(scene: bpy.types.Scene, run: Path) -> Path | None:

@@ -13,12 +13,12 @@ import numpy as np
 from mathutils import Matrix, Vector
 from mathutils.kdtree import KDTree
 
-from ..errors import InputError
-from .atomic_file import atomic_write
-from .deleted_splats import points_of
+from ...errors import InputError
+from ...scene.atomic_file import atomic_write
+from ...scene.deleted_splats import points_of
+from ...scene.regions import REGION
+from ...scene.splat_cloud import splat_axes
 from .questions import KINDS
-from .regions import REGION
-from .splat_cloud import splat_axes
 
 HALF = 0.5  # of the light along a ray, which the splats in front let through at the splat that is under the cursor
 SOLID = 0.2  # opacity of splats that make up a surface; fainter ones belong to the part of the nearest solid one

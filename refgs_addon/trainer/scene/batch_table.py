@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import bpy
+from bpy.props import CollectionProperty, IntProperty, StringProperty
 
-from .. import jobs
-from ..errors import InputError
-from ..json_file import read_json
+from ... import jobs
+from ...errors import InputError
+from ...json_file import read_json
 
 ROWS = "rows.json"  # in the batch's LOGS, as in backend/refgs/batch/batch.py
 LOG, PICTURE = (".log", ".txt"), (".png",)
@@ -122,7 +123,26 @@ def chosen_row(folder: Path) -> bpy.types.PropertyGroup | None:
     return rows[manager.refgs_row] if 0 <= manager.refgs_row < len(rows) else None
 
 
-def forget_table() -> None:
-    """Forget which batch's table is in the panel's list."""
+class BatchRow(bpy.types.PropertyGroup):
+    """Hold a row of the table of a batch, with the fields of `Row`."""
+
+    name: StringProperty()
+    state: StringProperty()
+    words: StringProperty()
+    what: StringProperty()
+    log: StringProperty()
+    picture: StringProperty()
+
+
+CLASSES = (BatchRow,)
+
+
+def register() -> None:
+    bpy.types.WindowManager.refgs_rows = CollectionProperty(type=BatchRow)
+    bpy.types.WindowManager.refgs_row = IntProperty(name="Run", description="Selected run of the batch")
+
+
+def unregister() -> None:
     global _shown
     _shown = None
+    del bpy.types.WindowManager.refgs_rows, bpy.types.WindowManager.refgs_row

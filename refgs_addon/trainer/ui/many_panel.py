@@ -10,15 +10,16 @@ from typing import ClassVar
 import bpy
 from bpy.props import IntProperty
 
-from .. import jobs
-from ..job_timers import follow_batch
-from ..preferences import letters, wrapped_text
-from ..scene import asset_library, batch_table, many
+from ... import jobs
+from ...preferences import letters, wrapped_text
+from ...ui.icons import thumbnail
+from ...ui.operators import Dismiss, ReportsErrors
+from ...ui.panels import Tab
+from ..scene import batch_assets, batch_table, many
+from ..timers import follow_batch
 from .closing import KeepTraining, StopRun
-from .icons import thumbnail
-from .operators import ReportsErrors, has_trainer
-from .panels import Tab
-from .train_panel import Dismiss, ImportTrained, TrainPanel, command_button, count_words, fraction, status_words
+from .on_capture import has_trainer
+from .train_panel import ImportTrained, TrainPanel, command_button, count_words, fraction, status_words
 
 ROWS = 5  # of the table, as it is drawn at first
 _ICONS = {"waiting": "SORTTIME", "running": "PLAY", "done": "CHECKMARK", "failed": "ERROR", "stopped": "PAUSE"}
@@ -59,7 +60,7 @@ class ImportAsAssets(ReportsErrors, bpy.types.Operator):
         return many.results_folder(context.scene) is not None
 
     def work(self, context: bpy.types.Context) -> None:
-        job = asset_library.import_as_assets(many.results_folder(context.scene))
+        job = batch_assets.import_as_assets(many.results_folder(context.scene))
         while bpy.app.background and not job.ended:  # there are no timers
             jobs.poll()
             time.sleep(0.05)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import bpy
 
-from .. import compat, jobs
-from ..errors import InputError
-from ..nodes.splats_tree import NAME
+from ... import compat, jobs
+from ...errors import InputError
+from ...nodes.splats_tree import NAME
 
 
 @dataclass
@@ -33,7 +33,7 @@ def watch(job: jobs.Job, scene: bpy.types.Scene, on: bool = True) -> None:
     for live in [live for live in _shown if live.job is job]:
         _remove(live)
     if on and not job.ended:
-        from .splat_cloud import add_splats
+        from ...scene.splat_cloud import add_splats
 
         name = f"{job.name} in training"
         item = add_splats(name, bpy.data.pointclouds.new(name), scene.collection)
@@ -67,7 +67,7 @@ def _read(path: Path) -> dict | None:
     """Read a preview's splats as attributes for `point_cloud`. Returns None if they cannot be read."""
     import numpy as np
 
-    from .splat_cloud import cloud_attributes, read_splats
+    from ...scene.splat_cloud import cloud_attributes, read_splats
 
     try:
         splats, _ = read_splats(path)
@@ -78,7 +78,7 @@ def _read(path: Path) -> dict | None:
 
 
 def _replace_points(live: _LiveObject, values: dict) -> None:
-    from .splat_cloud import point_cloud
+    from ...scene.splat_cloud import point_cloud
 
     item = bpy.data.objects[live.item]
     before, item.data = item.data, point_cloud(item.name, values)
@@ -92,3 +92,8 @@ def _remove(live: _LiveObject) -> None:
     item = bpy.data.objects.get(live.item)
     if item is not None:
         bpy.data.batch_remove([item, item.data, *item.data.materials])
+
+
+def unregister() -> None:
+    for live in list(_shown):
+        _remove(live)

@@ -6,18 +6,30 @@ from typing import ClassVar
 import bpy
 from bpy.props import StringProperty
 
-from .. import jobs, preferences
-from ..job_timers import follow_other_processes
-from ..preferences import letters, wrapped_text
+from ... import jobs
+from ...preferences import letters, wrapped_text
+from ...scene.regions import training_region
+from ...ui.operators import (
+    Dismiss,
+    FindRun,
+    OnJob,
+    OnRunFolder,
+    OpenManual,
+    ReportsErrors,
+    import_run_folder,
+    select_only,
+)
+from ...ui.panels import Tab
+from .. import preferences
 from ..scene import live_splats, training
-from ..scene.regions import add_training_region, training_region
 from ..scene.strokes import canvases, masks_root
+from ..scene.training_box import add_training_region
+from ..timers import follow_other_processes
 from .checked_capture import draw_capture
 from .closing import KeepTraining, StopRun
 from .decisions_box import draw_decisions
-from .icons import curve_icon, preview_icon
-from .operators import FindRun, OnCapture, OnJob, OnRunFolder, OpenManual, ReportsErrors, import_run_folder, select_only
-from .panels import Tab
+from .job_icons import curve_icon, preview_icon
+from .on_capture import OnCapture
 from .photo_buttons import MakeMasks, PaintStrokes, PhotosFromVideo, SaveStrokes
 
 
@@ -110,18 +122,6 @@ class ShowLiveSplats(OnJob, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         live_splats.watch(self.job, context.scene, not live_splats.is_watched(self.job))
-
-
-class Dismiss(OnJob, bpy.types.Operator):
-    bl_idname = "refgs.put_away"
-    bl_label = "Dismiss"
-    bl_description = "Stop this job if it still runs; remove it from the list if it has ended"
-
-    def work(self, context: bpy.types.Context) -> None:
-        if self.job.ended:
-            jobs.JOBS.remove(self.job)
-        else:
-            self.job.stop()
 
 
 class ImportTrained(OnRunFolder, bpy.types.Operator):
@@ -363,7 +363,6 @@ CLASSES = (
     RemoveFromList,
     SendCommand,
     ShowLiveSplats,
-    Dismiss,
     ImportTrained,
     TrainPanel,
 )

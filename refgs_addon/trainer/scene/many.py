@@ -4,10 +4,12 @@ from pathlib import Path
 
 import bpy
 
-from .. import jobs
-from ..errors import InputError
-from ..job_timers import follow_jobs
-from ..preferences import log_file, python
+from ... import jobs
+from ...errors import InputError
+from ...job_timers import follow_jobs
+from ...preferences import log_file
+from .. import commands
+from ..preferences import python
 
 
 def results_folder(scene: bpy.types.Scene) -> Path | None:
@@ -33,7 +35,7 @@ def train_many(scene: bpy.types.Scene) -> jobs.Job:
         raise InputError("no captures are chosen: choose the folder that they are in")
     trainer = python()
     jobs.JOBS[:] = [job for job in jobs.JOBS if not (job.ended and job.run == out / jobs.LOGS)]
-    job = jobs.train_many(trainer, captures, out, log_file(f"many {out.name}"), scene.refgs.many.preset)
+    job = commands.train_many(trainer, captures, out, log_file(f"many {out.name}"), scene.refgs.many.preset)
     follow_jobs()
     return job
 

@@ -7,14 +7,18 @@ from bpy.props import EnumProperty, FloatVectorProperty, IntProperty
 from bpy_extras.view3d_utils import region_2d_to_origin_3d, region_2d_to_vector_3d
 from mathutils import Vector
 
-from .. import jobs
-from ..errors import InputError, missing_module
-from ..preferences import wrapped_text
+from ... import jobs
+from ...errors import InputError, missing_module
+from ...preferences import wrapped_text
+from ...scene.doubt import has_doubt
+from ...scene.run_parts import active_run
+from ...ui.icons import thumbnail
+from ...ui.materials_panel import MaterialPanel
+from ...ui.operators import OnRun
 from ..scene import training
-from ..scene.questions import questions
-from ..scene.run_parts import active_run
+from ..scene.questions import KINDS, questions
 from . import highlight
-from .operators import OnRun, has_trainer
+from .on_capture import has_trainer
 
 if TYPE_CHECKING:
     import numpy as np
@@ -71,7 +75,7 @@ class Hint(OnRun, bpy.types.Operator):
 
     def _begin(self, context: bpy.types.Context) -> set[str]:
         """Ask whether to train, or wait for a click where no part is known yet."""
-        from ..scene.edit import splats_of
+        from ...scene.edit import splats_of
         from ..scene.hints import Surface, chosen_part
 
         run = active_run(context)
@@ -189,4 +193,31 @@ def clicked_ray(screen: bpy.types.Screen, x: int, y: int) -> tuple[Vector, Vecto
     return region_2d_to_origin_3d(region, region.data, place), region_2d_to_vector_3d(region, region.data, place)
 
 
+def _draw(self, context: bpy.types.Context) -> None:
+    """Draw the questions about the active run's materials at the end of the Materials panel, and buttons for hints without a question."""
+    layout, run = self.layout, active_run(context)
+    for number, question in enumerate(questions(run) if run and has_doubt(run) else (), 1):
+        box = layout.box()
+        box.label(text=f"Metal or paint? {question.part:.0%}, now {question.now}", icon="QUESTION")
+        if shown := thumbnail(question.picture, round(1e4 * question.part)):
+            box.template_icon(icon_value=shown, scale=8)
+        row = box.row(align=True)
+        for kind in KINDS:
+            button = row.operator(Hint.bl_idname, text=kind.capitalize(), depress=kind == question.now)
+            button.kind, button.question = kind, number
+    row = layout.row(align=True)
+    metal = row.operator(Hint.bl_idname, text="This Part Is Metal")
+    paint = row.operator(Hint.bl_idname, text="This Part Is Paint")
+    metal.kind, paint.kind = KINDS
+    metal.question = paint.question = 0
+
+
 CLASSES = (Hint,)
+
+
+def register() -> None:
+    MaterialPanel.append(_draw)
+
+
+def unregister() -> None:
+    MaterialPanel.remove(_draw)

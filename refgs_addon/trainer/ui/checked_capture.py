@@ -5,11 +5,11 @@ from typing import ClassVar
 
 import bpy
 
-from .. import jobs
-from ..scene.capture_cameras import cameras_of, remove_cameras, show_cameras
-from ..scene.regions import remove_guessed_region, show_guessed_region
-from .icons import thumbnail
-from .operators import OnJob, select_only
+from ... import jobs
+from ...scene.capture_cameras import cameras_of, remove_cameras, show_cameras
+from ...ui.icons import thumbnail
+from ...ui.operators import OnJob, select_only
+from ..scene.training_box import remove_guessed_region, show_guessed_region
 
 
 class ShowCameras(OnJob, bpy.types.Operator):

@@ -8,11 +8,12 @@ from pathlib import Path
 import bpy
 from bpy.props import StringProperty
 
-from ..preferences import wrapped_text
+from ...preferences import wrapped_text
+from ...ui.icons import thumbnail
+from ...ui.operators import OnRunFolder
 from ..scene import training
 from ..scene.decisions import Decision, confirm, open_decisions
-from .icons import thumbnail
-from .operators import OnRunFolder, has_trainer
+from .on_capture import has_trainer
 
 NAMES = {  # the question, and its two answers
     "specular": ("Gloss", "Glossy", "Matte"),

@@ -12,8 +12,8 @@ from typing import ClassVar
 import bpy
 from bpy.props import EnumProperty
 
-from .. import jobs
-from .operators import OnJob, OnRunFolder, ReportsErrors
+from ... import jobs
+from ...ui.operators import OnJob, OnRunFolder, ReportsErrors
 
 _keys: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
 

@@ -2,9 +2,9 @@
 
 import bpy
 
-from .. import jobs
-from ..preferences import letters
-from ..scene.strokes import STROKES
+from ... import jobs
+from ...preferences import letters
+from ...scene.camera_objects import STROKES
 from .photo_buttons import PAINTS, ChooseBrush, SaveStrokes
 from .train_panel import draw_job
 

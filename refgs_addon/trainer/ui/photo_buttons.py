@@ -7,10 +7,11 @@ from typing import ClassVar
 import bpy
 from bpy.props import EnumProperty, IntProperty, StringProperty
 
-from .. import compat
+from ... import compat
+from ...ui.operators import ReportsErrors
 from ..scene import training
 from ..scene.strokes import add_canvas, camera_with_photo
-from .operators import OnCapture, ReportsErrors, has_trainer
+from .on_capture import OnCapture, has_trainer
 
 HARD_BRUSH = "brushes/essentials_brushes-mesh_texture.blend/Brush/Paint Hard"
 PAINTS = {

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import bpy
 
-from ..errors import InputError
-from ..json_file import read_json
-from .run_parts import FOLDER
+from ...errors import InputError
+from ...json_file import read_json
+from ...scene.run_parts import FOLDER
 
 if TYPE_CHECKING:
     import numpy as np

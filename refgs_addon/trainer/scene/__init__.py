@@ -1,0 +1,1 @@
+"""Train with plain functions, which read and write Blender data. Operators and scripts call them."""
