@@ -120,8 +120,10 @@ def run(folder, program):
     """Run a program in a Blender of its own, which has the repositories of `installed`. Returns what it prints."""
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     environment |= {"BLENDER_USER_RESOURCES": str(folder / "user"), "PYTHONDONTWRITEBYTECODE": "1"}
-    code = f"{PRELUDE.format(folder=str(folder))}{program}\nprint('did it all')"
-    done = subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True)
+    end = "print('did it all', flush=True)\nimport os\nos._exit(0)"  # Blender's own clean-up at exit can hang
+    code = f"{PRELUDE.format(folder=str(folder))}{program}\n{end}"
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
     assert "did it all" in done.stdout and "Traceback" not in done.stderr, done.stdout + done.stderr
     return done.stdout
 
@@ -239,12 +241,21 @@ for _ in range(2):
     assert ours() == both, ours() ^ both
     off(FIRST)
     assert ours() == waiting, ours() ^ waiting
+for name in [name for name in sys.modules if name.startswith(FIRST)]:
+    del sys.modules[name]  # as Blender does when it updates an extension
 on(FIRST)
+assert ours() == both
 bpy.ops.wm.read_homefile(use_empty=True)
 assert ours() == both
+bpy.utils.load_scripts(reload_scripts=True)
+assert ours() == both, ours() ^ both
 for module in (FIRST, SECOND):
     off(module)
 assert ours() == before
+on(SECOND)
+on(FIRST)
+bpy.ops.wm.read_factory_settings()
+assert ours() == before, ours() ^ before
 """,
     )
 
