@@ -31,7 +31,7 @@ def python() -> Path:
     if preferences().python:
         return Path(bpy.path.abspath(preferences().python))
     if not set_up():
-        raise InputError("no trainer is set up: install it, or choose its Python, in the add-on's preferences")
+        raise InputError("no trainer is set up: install it, or choose its Python, in the preferences of RefGS Trainer")
     return installation.python(home())
 
 
@@ -137,7 +137,7 @@ def status() -> tuple[str, str]:
 def installation_problem() -> str:
     """Return why the trainer cannot be installed now, or "" if it can."""
     if not installation.bundled_version():
-        return "This copy of the add-on contains no trainer: choose a Python that has it"
+        return "This copy of RefGS Trainer contains no trainer: choose a Python that has it"
     if preferences().python:
         return "A Python is chosen: clear its field to install the trainer here"
     if not bpy.app.online_access:

@@ -153,6 +153,14 @@ def test_refgs_alone_is_what_extensions_blender_org_takes(repository):
             assert len(text) <= 64 and text[-1].isalnum()
 
 
+def test_both_have_the_version_of_the_package(repository):
+    listed = json.loads((repository / "index.json").read_text())["data"]
+    package = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert {extension["id"]: extension["version"] for extension in listed} == dict.fromkeys(
+        ("refgs", "refgs_trainer"), package["version"]
+    )
+
+
 def test_the_repository_has_the_hashes_that_blender_checks(repository, tmp_path):
     for listed in json.loads((repository / "index.json").read_text())["data"]:
         data = (repository / listed["archive_url"]).read_bytes()

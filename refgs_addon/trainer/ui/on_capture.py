@@ -22,5 +22,5 @@ class OnCapture(ReportsErrors):
 
 def has_trainer(operator: type[bpy.types.Operator]) -> bool:
     """Check whether a trainer is set up, and explain in the tooltip if not."""
-    operator.poll_message_set("Set up the trainer in the add-on's preferences first")
+    operator.poll_message_set("Set up the trainer in the preferences of RefGS Trainer first")
     return set_up()

@@ -22,7 +22,7 @@ class InstallTrainer(ReportsErrors, bpy.types.Operator):
     bl_idname = "refgs.install_trainer"
     bl_label = "Install the Trainer"
     bl_description = (
-        "Download the trainer's packages and install them in the add-on's own folder, in the background. "
+        "Download the trainer's packages and install them in the extension's own folder, in the background. "
         "Nothing else on this machine changes"
     )
     bl_options: ClassVar = {"REGISTER"}
