@@ -1,4 +1,4 @@
-"""Hide the differences between Blender 4.3, 4.5 LTS and 5.2 LTS behind functions. No other module checks Blender's version."""
+"""Hide the differences between Blender 4.3, 4.5 LTS, 5.2 LTS and 5.3 behind functions. No other module checks Blender's version."""
 
 import bpy
 

@@ -1,7 +1,8 @@
-"""Test Blender's own import of splats in glTF: it has no splats there, but shows points and keeps the materials as attributes."""
+"""Test Blender's own import of splats in glTF: it keeps the materials as attributes. Blender 5.3 shows splats, earlier ones points."""
 
 import bpy
 import numpy as np
+from mathutils import Vector
 
 from refgs.export.turned import turned
 from refgs.formats.mesh import Y_UP
@@ -16,16 +17,20 @@ def test_points_with_materials(tmp_path, scene):
     write_splats_glb(tmp_path / "des éclats.glb", turned(splats, Y_UP))
     bpy.ops.import_scene.gltf(filepath=str(tmp_path / "des éclats.glb"))
     bpy.context.view_layer.update()
-    (found,) = (item for item in bpy.data.objects if item.type == "MESH")
-    assert len(found.data.vertices) == COUNT and not found.data.polygons
-    places = np.array([found.matrix_world @ vertex.co for vertex in found.data.vertices])
-    np.testing.assert_allclose(places, splats.positions, atol=1e-6)
+    (found,) = (item for item in bpy.data.objects if item.type in ("MESH", "POINTCLOUD"))
 
-    def values(name):
-        numbers = np.empty(COUNT * 3, np.float32)
+    def values(name, width=3):
+        numbers = np.empty(COUNT * width, np.float32)
         found.data.attributes[name].data.foreach_get("vector", numbers)
-        return numbers.reshape(COUNT, 3)
+        return numbers.reshape(COUNT, width)
 
+    places = np.array([found.matrix_world @ Vector(place) for place in values("position")])
+    np.testing.assert_allclose(places, splats.positions, atol=1e-6)
+    if found.type == "POINTCLOUD":
+        assert found.data.type == "GAUSSIAN_SPLAT"
+        np.testing.assert_allclose(values("radiance:base", width=4)[:, 3], splats.opacities, atol=1e-6)
+    else:
+        assert not found.data.polygons
     np.testing.assert_array_equal(values("_METALLIC_ROUGHNESS")[:, 2], splats.metallic)
     np.testing.assert_array_equal(values("_METALLIC_ROUGHNESS")[:, 1], splats.roughness)
     np.testing.assert_array_equal(values("_BASE_COLOR"), splats.albedo)
