@@ -27,11 +27,13 @@ def add_region(splats: bpy.types.Object, collection: bpy.types.Collection, name:
 
 def bounds(cloud: bpy.types.PointCloud) -> tuple[Vector, Vector]:
     """Return a point cloud's lowest and highest corner without 2 % of points per side."""
-    places = [0.0] * (3 * len(cloud.points))
-    cloud.attributes["position"].data.foreach_get("vector", places)
-    axes = [sorted(places[axis::3]) for axis in range(3)]
-    low, high = (Vector(axis[int(part * (len(axis) - 1))] for axis in axes) for part in (0.02, 0.98))
-    return low, high
+    import numpy as np  # Debian's Blender may lack it
+
+    places = np.empty((len(cloud.points), 3), np.float32)
+    cloud.attributes["position"].data.foreach_get("vector", places.ravel())
+    ends = [int(part * (len(places) - 1)) for part in (0.02, 0.98)]
+    low, high = np.partition(places, ends, axis=0)[ends].tolist()
+    return Vector(low), Vector(high)
 
 
 def crop(splats: bpy.types.Object, collection: bpy.types.Collection, on: bool) -> bpy.types.Object | None:
