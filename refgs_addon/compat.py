@@ -7,6 +7,9 @@ EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT
 # How Eevee weakens the directional part of the world's diffuse light: see `nodes.world_diffuse`.
 EEVEE_WINDOW_BY_LENGTH = bpy.app.version >= (5, 1, 0)
 
+# From 5.3 Blender draws point clouds as Gaussian splats.
+DRAWS_SPLATS = "type" in bpy.types.PointCloud.bl_rna.properties
+
 # Image settings of a file format, in the order to set them; from 5.0 a format belongs to a medium.
 FORMAT = (["media_type"] if bpy.app.version >= (5, 0, 0) else []) + ["file_format", "color_mode", "color_depth"]
 
@@ -26,7 +29,7 @@ def set_format(settings: bpy.types.ImageFormatSettings, kind: str, depth: str) -
 
 def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
     """Make a point cloud of `count` points at the origin."""
-    if hasattr(bpy.types.PointCloud, "resize"):  # from 5.1
+    if "resize" in bpy.types.PointCloud.bl_rna.functions:  # from 5.1; hasattr is always False
         cloud = bpy.data.pointclouds.new(name)
         cloud.resize(count)
         return cloud

@@ -156,8 +156,12 @@ def mesh_edits_tree() -> bpy.types.NodeTree:
     add_input(tree, "Splats", "Object")
     group = add(tree, "NodeGroupInput").outputs
     splats = add(tree, "GeometryNodeObjectInfo", {"Object": group["Splats"]}, transform_space="ORIGINAL")
-    # The modifiers turn each splat into a quad; its centre is the splat's position.
-    centres = out(add(tree, "GeometryNodeMeshToPoints", {"Mesh": splats.outputs["Geometry"]}, mode="FACES"))
+    # Splats are drawn as points, or as quads in a mesh; a quad's centre is the splat's position.
+    parts = add(tree, "GeometryNodeSeparateComponents", {"Geometry": splats.outputs["Geometry"]}).outputs
+    quads = out(add(tree, "GeometryNodeMeshToPoints", {"Mesh": parts["Mesh"]}, mode="FACES"))
+    joined = add(tree, "GeometryNodeJoinGeometry", {"Geometry": quads})
+    tree.links.new(parts["Point Cloud"], joined.inputs["Geometry"])
+    centres = out(joined)
     position = out(add(tree, "GeometryNodeInputPosition"))
     nearest = add(tree, "GeometryNodeSampleNearest", {"Geometry": centres, "Sample Position": position})
     stored = group["Geometry"]

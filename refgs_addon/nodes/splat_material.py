@@ -5,6 +5,7 @@ import bpy
 from ..compat import node_tree
 from . import add, math, out, principled, scaled, vector_math
 from .edit_tree import AMOUNT
+from .splats_tree import EXTENT, draws_splats
 from .world_diffuse import surface_inputs
 
 VALUES_NAME = "RefGS Splat Values"
@@ -14,7 +15,7 @@ _SURFACE = {"metallic": "Metallic", "roughness": "Roughness", "specular": SPECUL
 
 
 def splat_material(name: str, constants: dict[str, float], two_sided: bool = False) -> bpy.types.Material:
-    """Make a Principled material for the quads of `nodes.splats_tree`. It reads each splat's base colour, metallic and roughness.
+    """Make a Principled material for what `nodes.splats_tree` draws. It reads each splat's base colour, metallic and roughness.
 
     `constants` maps "metallic", "roughness" or "specular" to one value for all splats. The material then uses this value, and not the
     splats' own.
@@ -76,11 +77,14 @@ def values_material() -> bpy.types.Material:
 
 
 def _finish(material: bpy.types.Material, shader: bpy.types.NodeSocket) -> None:
-    """Give a splat its Gaussian alpha, and connect its `shader` to the material's output."""
-    # In each of its samples, Eevee draws a quad with a probability equal to its alpha, and the nearest one drawn is visible. The mean over
-    # the samples equals alpha compositing of the quads, sorted by depth in each pixel.
+    """Give a splat its Gaussian alpha, unless Blender does, and connect its `shader` to the material's output."""
+    # In each of its samples, Eevee draws a splat with a probability equal to its alpha, and the nearest one drawn is visible. The mean over
+    # the samples equals alpha compositing of the splats, sorted by depth in each pixel.
     material.surface_render_method = "DITHERED"
     tree = material.node_tree
+    if draws_splats():
+        add(tree, "ShaderNodeOutputMaterial", {"Surface": shader})
+        return
     gaussian = _attribute(tree, "gaussian", VECTOR)
     exponent = math(tree, "MULTIPLY", vector_math(tree, "DOT_PRODUCT", gaussian, gaussian), -0.5)
     alpha = math(tree, "MULTIPLY", _attribute(tree, "opacity", FACTOR), math(tree, "EXPONENT", exponent))
@@ -95,10 +99,10 @@ def _attribute(tree: bpy.types.NodeTree, name: str, output: int) -> bpy.types.No
 
 def _normal(tree: bpy.types.NodeTree, two_sided: bool) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
     """Add nodes for a curved splat's world-space normal, with `two_sided` turned to the viewer, and visible side (1 front, 0 back)."""
-    u_v = add(tree, "ShaderNodeSeparateXYZ", {"Vector": _attribute(tree, "gaussian", VECTOR)}).outputs
+    u, v = _place(tree)
     centre = _attribute(tree, "normal", VECTOR)
-    bent = vector_math(tree, "ADD", centre, scaled(tree, _attribute(tree, "normal_u", VECTOR), u_v["X"]))
-    bent = vector_math(tree, "ADD", bent, scaled(tree, _attribute(tree, "normal_v", VECTOR), u_v["Y"]))
+    bent = vector_math(tree, "ADD", centre, scaled(tree, _attribute(tree, "normal_u", VECTOR), u))
+    bent = vector_math(tree, "ADD", bent, scaled(tree, _attribute(tree, "normal_v", VECTOR), v))
 
     def to_world(vector: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         kind = {"vector_type": "NORMAL", "convert_from": "OBJECT", "convert_to": "WORLD"}
@@ -113,3 +117,23 @@ def _normal(tree: bpy.types.NodeTree, two_sided: bool) -> tuple[bpy.types.NodeSo
     # Near silhouettes the normal can point away from the viewer, and a BSDF would be black: it is turned until it is perpendicular.
     away = math(tree, "MINIMUM", vector_math(tree, "DOT_PRODUCT", bent, viewer), 0.0)
     return vector_math(tree, "NORMALIZE", vector_math(tree, "SUBTRACT", bent, scaled(tree, viewer, away))), front
+
+
+def _place(tree: bpy.types.NodeTree) -> list[bpy.types.NodeSocket]:
+    """Add nodes for the position on the splat along its two axes, in standard deviations."""
+    if not draws_splats():
+        return add(tree, "ShaderNodeSeparateXYZ", {"Vector": _attribute(tree, "gaussian", VECTOR)}).outputs[:2]
+    # Blender's splats face the viewer. Intersect the line of sight with the splat's plane, in the object's coordinates.
+    geometry = add(tree, "ShaderNodeNewGeometry").outputs
+    space = {"convert_from": "WORLD", "convert_to": "OBJECT"}
+    position, viewer = (
+        out(add(tree, "ShaderNodeVectorTransform", {"Vector": geometry[name]}, vector_type=kind, **space))
+        for name, kind in (("Position", "POINT"), ("Incoming", "VECTOR"))
+    )
+    axes = [_attribute(tree, name, VECTOR) for name in ("gaussian_u", "gaussian_v")]
+    away = vector_math(tree, "SUBTRACT", position, _attribute(tree, "gaussian_centre", VECTOR))
+    plane = vector_math(tree, "NORMALIZE", vector_math(tree, "CROSS_PRODUCT", *axes))
+    height, slant = (vector_math(tree, "DOT_PRODUCT", vector, plane) for vector in (away, viewer))
+    hit = vector_math(tree, "SUBTRACT", away, scaled(tree, viewer, math(tree, "DIVIDE", height, slant)))
+    places = (vector_math(tree, "DOT_PRODUCT", hit, axis) for axis in axes)
+    return [math(tree, "MAXIMUM", math(tree, "MINIMUM", place, EXTENT), -EXTENT) for place in places]

@@ -23,7 +23,14 @@ _SHIFTS = 0.0, 0.23
 _SPREAD = (  # shifts and masks that put two zeros between the bits of a number
     (32, 0x001F00000000FFFF), (16, 0x001F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
 )  # fmt: skip
-_TYPES = {"base_color": "FLOAT_COLOR", "rotation": "QUATERNION"}
+_TYPES = {"base_color": "FLOAT_COLOR", "rotation": "QUATERNION", "radiance:base": "FLOAT4"}
+_FIELDS = {
+    "FLOAT": "value",
+    "FLOAT_VECTOR": "vector",
+    "FLOAT4": "vector",
+    "FLOAT_COLOR": "color",
+    "QUATERNION": "value",
+}
 REF_GAUSSIAN = "ori_color_0", "ori_color_1", "ori_color_2", "refl_strength", "roughness"  # its materials, as logits
 _SPLATS = re.compile(
     r"[xyz]|n[xyz]|f_dc_[012]|f_rest_\d+|opacity|scale_[012]|rot_[0123]|albedo_[rgb]|metallic|roughness|doubt|received_[rgb]|ind_\d+"
@@ -66,13 +73,19 @@ def cloud_attributes(
     vectors have three components and its colours four. So scale gets a third component and base_color a fourth, both 1.
     """
     one = np.ones((len(splats["position"]), 1), np.float32)
-    return splats | {
-        "scale": np.hstack([splats["scale"], one]),
-        "base_color": np.hstack([splats["base_color"], one]),
-        "normal_u": normal_u,
-        "normal_v": normal_v,
-        "radius": splats["scale"].mean(axis=1),  # for drawing without the modifier
-    }
+    # Blender's Gaussian splats have their opacity here, after a colour that only Blender's own material reads.
+    native = {"radiance:base": np.pad(splats["opacity"][:, None], ((0, 0), (3, 0)))} if compat.DRAWS_SPLATS else {}
+    return (
+        splats
+        | native
+        | {
+            "scale": np.hstack([splats["scale"], one]),
+            "base_color": np.hstack([splats["base_color"], one]),
+            "normal_u": normal_u,
+            "normal_v": normal_v,
+            "radius": splats["scale"].mean(axis=1),  # for drawing without the modifier
+        }
+    )
 
 
 def point_cloud(name: str, values: dict[str, np.ndarray]) -> bpy.types.PointCloud:
@@ -84,8 +97,7 @@ def point_cloud(name: str, values: dict[str, np.ndarray]) -> bpy.types.PointClou
     for key, value in (values | {"base_color": from_rec709(values["base_color"])}).items():
         kind = _TYPES.get(key, "FLOAT" if value.ndim == 1 else "FLOAT_VECTOR")
         attribute = cloud.attributes.get(key) or cloud.attributes.new(key, kind, "POINT")
-        field = {"FLOAT": "value", "FLOAT_VECTOR": "vector", "FLOAT_COLOR": "color", "QUATERNION": "value"}[kind]
-        attribute.data.foreach_set(field, np.ascontiguousarray(value, np.float32).ravel())
+        attribute.data.foreach_set(_FIELDS[kind], np.ascontiguousarray(value, np.float32).ravel())
     return cloud
 
 

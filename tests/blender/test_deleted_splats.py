@@ -11,7 +11,7 @@ from refgs_addon.scene.edit import add_edit, is_edited
 from refgs_addon.scene.export_run import export_mesh, export_run, export_splats
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.run_parts import show
-from tests.makers.blender import attribute, evaluated_mesh
+from tests.makers.blender import attribute, drawn
 from tests.makers.runs import COUNT
 
 GONE = [3, 17, 39]
@@ -25,11 +25,6 @@ def delete(points, rows):
     bpy.ops.mesh.delete(type="VERT")
 
 
-def drawn(run):
-    """Return the roughness of each splat that is drawn."""
-    return attribute(evaluated_mesh(run.splats), "roughness")[::4]
-
-
 @pytest.fixture
 def run(run):
     """Show the splats of the imported run, moved, and delete three of them."""
@@ -41,15 +36,15 @@ def run(run):
 
 def test_deleted_points_are_splats_that_are_not_drawn(run):
     roughness = attribute(run.splats.data, "roughness")
-    np.testing.assert_array_equal(drawn(run), np.delete(roughness, GONE))  # in Edit Mode already
+    np.testing.assert_array_equal(drawn(run.splats, "roughness"), np.delete(roughness, GONE))  # in Edit Mode already
     bpy.ops.object.mode_set(mode="OBJECT")
-    np.testing.assert_array_equal(drawn(run), np.delete(roughness, GONE))
+    np.testing.assert_array_equal(drawn(run.splats, "roughness"), np.delete(roughness, GONE))
     assert add_points(run.splats) == points_of(run.splats)
     delete(points_of(run.splats), [0])
     bpy.ops.object.mode_set(mode="OBJECT")
-    np.testing.assert_array_equal(drawn(run), np.delete(roughness, [0, *GONE]))
+    np.testing.assert_array_equal(drawn(run.splats, "roughness"), np.delete(roughness, [0, *GONE]))
     restore(run.splats)
-    np.testing.assert_array_equal(drawn(run), roughness)
+    np.testing.assert_array_equal(drawn(run.splats, "roughness"), roughness)
     assert points_of(run.splats) is None and NAME not in run.splats.modifiers
     assert not any("to delete" in item.name for item in [*bpy.data.objects, *bpy.data.meshes])
 
@@ -90,8 +85,8 @@ def test_buttons_delete_and_restore(run_folder, addon):
     assert not points.show_in_front  # all points together would cover the object
     assert not is_edited(run.splats)  # nothing is deleted yet
     bpy.ops.object.mode_set(mode="OBJECT")
-    assert len(drawn(run)) == COUNT and not is_edited(run.splats)
+    assert len(drawn(run.splats, "roughness")) == COUNT and not is_edited(run.splats)
     delete(points, GONE)
     assert is_edited(run.splats) and count_deleted(run.splats) == len(GONE)
     bpy.ops.refgs.restore_splats(splats=run.splats.name)
-    assert len(drawn(run)) == COUNT and points_of(run.splats) is None
+    assert len(drawn(run.splats, "roughness")) == COUNT and points_of(run.splats) is None

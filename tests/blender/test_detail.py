@@ -5,21 +5,18 @@ import numpy as np
 import pytest
 
 from refgs.formats.gltf import write_glb
-from refgs_addon.nodes.splats_tree import EXTENT
 from refgs_addon.scene.detail import LEVELS, detail, set_detail
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.run_parts import show
-from tests.makers.blender import attribute, evaluated_mesh
+from tests.makers.blender import drawn, drawn_axes
 from tests.makers.box import textured_box
 from tests.makers.runs import random_columns, write_ply
 
 
 def areas(run):
-    """Return the areas of the quads that are drawn, in squared standard deviations, by the splats' roughness, which tells them apart."""
-    mesh = evaluated_mesh(run.splats)
-    corners = attribute(mesh, "position").reshape(-1, 4, 3)
-    sides = np.linalg.norm(corners[:, [1, 2]] - corners[:, :1], axis=2)
-    return dict(zip(attribute(mesh, "roughness")[::4].tolist(), (sides.prod(axis=1) / EXTENT**2).tolist(), strict=True))
+    """Return the areas of the splats that are drawn, by their roughness, which tells them apart."""
+    sides = np.linalg.norm(drawn_axes(run.splats)[1], axis=2)
+    return dict(zip(drawn(run.splats, "roughness").tolist(), sides.prod(axis=1).tolist(), strict=True))
 
 
 def test_fewer_splats_cover_as_much(run_folder, scene):

@@ -22,7 +22,7 @@ from refgs_addon.scene.render_eevee import render_preview
 from refgs_addon.scene.run_parts import show
 from refgs_addon.scene.splat_cloud import read_splats
 from refgs_addon.ui.materials_panel import MaterialPanel
-from tests.makers.blender import attribute, evaluated_mesh
+from tests.makers import blender
 from tests.makers.box import SIZE, textured_box
 from tests.makers.runs import COUNT, random_columns, write_ply
 
@@ -41,8 +41,8 @@ def doubtful(run_folder):
 
 
 def displayed(run):
-    """Return the colours of the drawn quads, one a splat."""
-    return attribute(evaluated_mesh(run.splats), "display")[::4]
+    """Return the colours of the drawn splats."""
+    return blender.drawn(run.splats, "display")
 
 
 def mixed(doubt):
@@ -57,8 +57,7 @@ def test_splats_are_colored_and_have_their_material_back(doubtful, scene):
     assert doubt_shown(run.collection)
     np.testing.assert_allclose(displayed(run)[:, :3], mixed(np.linspace(0, 1, COUNT))[:, :3], atol=1e-5)
     show_doubt(run.collection, False)
-    mesh = evaluated_mesh(run.splats)
-    assert mesh.materials[mesh.polygons[0].material_index].name == run.splats.data.materials[0].name
+    assert blender.drawn_material(run.splats) == run.splats.data.materials[0].name
     assert not doubt_shown(run.collection)
 
 

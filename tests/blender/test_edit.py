@@ -13,7 +13,8 @@ from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.material_presets import set_material
 from refgs_addon.scene.regions import crop
 from refgs_addon.scene.run_parts import show
-from tests.makers.blender import attribute, evaluated_mesh
+from tests.makers import blender
+from tests.makers.blender import attribute
 from tests.makers.still_life import write_still_life
 
 GOLD = (1.0, 0.766, 0.336), 1.0, 0.15  # base colour, metallic, roughness
@@ -28,8 +29,8 @@ def run(run):
 
 
 def drawn(run, name):
-    """Read an attribute of the splats after all edits: one value per splat, taken from the first corner of its quad."""
-    return attribute(evaluated_mesh(run.splats), name)[::4]
+    """Read an attribute of the splats after all edits: one value per splat."""
+    return blender.drawn(run.splats, name)
 
 
 def learned(run, name):

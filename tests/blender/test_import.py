@@ -16,7 +16,9 @@ from refgs.errors import InputWarning
 from refgs.formats.splats import read_splats as read_by_refgs
 from refgs_addon import compat
 from refgs_addon.errors import InputError
-from refgs_addon.nodes.splats_tree import EXTENT, NAME
+from refgs_addon.nodes import splats_tree
+from refgs_addon.nodes.splat_material import VALUES_NAME
+from refgs_addon.nodes.splats_tree import NAME
 from refgs_addon.scene.camera_objects import frame_camera, next_camera, photo_shown, show_photo
 from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.export_run import export_mesh, export_splats
@@ -27,7 +29,7 @@ from refgs_addon.scene.run_parts import cameras, parts, show
 from refgs_addon.scene.run_toml import newer_release
 from refgs_addon.scene.splat_cloud import MATERIALS, normal_slopes, read_splats
 from refgs_addon.scene.world_light import relight
-from tests.makers.blender import attribute, evaluated_mesh
+from tests.makers.blender import attribute, drawn, drawn_axes, drawn_material, drawn_splats
 from tests.makers.box import rewrite_glb
 from tests.makers.distances import spread
 from tests.makers.runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_columns, write_ply
@@ -85,44 +87,62 @@ def test_points_hold_what_the_file_holds(run):
     np.testing.assert_allclose(attribute(cloud, "roughness"), columns["roughness"], **close)
 
 
-def test_quads_lie_in_the_splats_planes(run):
+def test_splats_are_drawn_where_they_lie(run):
     show(run.collection, "splats")
     columns = random_columns()
-    mesh = evaluated_mesh(run.splats)
-    assert len(mesh.polygons) == COUNT and len(mesh.vertices) == 4 * COUNT
-    corners = attribute(mesh, "position").reshape(COUNT, 4, 3)
-    u_v = attribute(mesh, "gaussian").reshape(COUNT, 4, 3)
-    assert {tuple(c) for c in u_v[0].tolist()} == {(a, b, 0.0) for a in (-EXTENT, EXTENT) for b in (-EXTENT, EXTENT)}
-    axes = quaternion_matrix(stacked(columns, "rot_0 rot_1 rot_2 rot_3"))[:, :, :2]
-    axes = axes * np.exp(stacked(columns, "scale_0 scale_1"))[:, None]
-    expected = stacked(columns, "x y z")[:, None] + u_v[:, :, :2] @ np.swapaxes(axes, 1, 2)
-    np.testing.assert_allclose(corners, expected, atol=2e-6)
-    np.testing.assert_allclose(attribute(mesh, "roughness"), np.repeat(columns["roughness"], 4), atol=1e-6)
+    centres, axes = drawn_axes(run.splats)
+    assert len(centres) == COUNT
+    expected = quaternion_matrix(stacked(columns, "rot_0 rot_1 rot_2 rot_3"))[:, :, :2]
+    expected = expected * np.exp(stacked(columns, "scale_0 scale_1"))[:, None]
+    np.testing.assert_allclose(centres, stacked(columns, "x y z"), atol=2e-6)
+    np.testing.assert_allclose(axes, np.swapaxes(expected, 1, 2), atol=2e-6)
+    np.testing.assert_allclose(drawn(run.splats, "roughness"), columns["roughness"], atol=1e-6)
+    if not compat.DRAWS_SPLATS:
+        corners = attribute(drawn_splats(run.splats), "gaussian").reshape(COUNT, 4, 3)
+        assert (corners == corners[0]).all()
+        return
+    np.testing.assert_allclose(drawn(run.splats, "radiance:base")[:, 3], drawn(run.splats, "opacity"), atol=1e-6)
+    assert (drawn(run.splats, "scale")[:, 2] > 0).all()
+    for number, name in enumerate(("gaussian_u", "gaussian_v")):
+        along = np.einsum("nij,nj->ni", axes, drawn(run.splats, name))
+        np.testing.assert_allclose(along, np.tile(np.eye(2)[number], (COUNT, 1)), atol=1e-4)
+
+
+@pytest.mark.skipif(not compat.DRAWS_SPLATS, reason="this Blender draws quads")
+def test_a_file_of_an_earlier_blender_keeps_quads(run_folder, scene, monkeypatch):
+    with monkeypatch.context() as earlier:
+        earlier.setattr(splats_tree, "DRAWS_SPLATS", False)
+        import_run(run_folder, scene)
+    run = import_run(run_folder, scene)
+    show(run.collection, "splats")
+    graph = bpy.context.evaluated_depsgraph_get()
+    shown = [i.object for i in graph.object_instances if i.object.original == run.splats]
+    assert "MESH" in {item.type for item in shown}
+    nodes = run.splats.data.materials[0].node_tree.nodes
+    assert "gaussian" in {node.attribute_name for node in nodes if node.type == "ATTRIBUTE"}
 
 
 def test_size_opacity_cut_and_display(run):
     show(run.collection, "splats")
     columns, modifier = random_columns(), run.splats.modifiers[NAME]
-    whole = attribute(evaluated_mesh(run.splats), "position").reshape(COUNT, 4, 3)
+    whole = drawn_axes(run.splats)
     compat.set_modifier_input(modifier, "Size", 0.5)
-    half = attribute(evaluated_mesh(run.splats), "position").reshape(COUNT, 4, 3)
-    centre = stacked(columns, "x y z")[:, None]
-    np.testing.assert_allclose(half - centre, (whole - centre) / 2, atol=1e-6)
+    half = drawn_axes(run.splats)
+    np.testing.assert_allclose(half[0], whole[0], atol=1e-6)
+    np.testing.assert_allclose(half[1], whole[1] / 2, atol=1e-6)
 
     compat.set_modifier_input(modifier, "Opacity Cut", 0.6)
     kept = 1 / (1 + np.exp(-columns["opacity"])) >= 0.6
     assert 0 < kept.sum() < COUNT
     compat.set_modifier_input(modifier, "Display", "Metallic")
-    mesh = evaluated_mesh(run.splats)
-    assert mesh.materials[mesh.polygons[0].material_index].name == "RefGS Splat Values"
-    shown = attribute(mesh, "display")[::4]
+    assert drawn_material(run.splats) == VALUES_NAME
+    shown = drawn(run.splats, "display")
     np.testing.assert_allclose(shown[:, :3], np.repeat(columns["metallic"][kept, None], 3, axis=1), atol=1e-6)
     compat.set_modifier_input(modifier, "Display", "Normal")
-    shown = attribute(evaluated_mesh(run.splats), "display")[::4]
+    shown = drawn(run.splats, "display")
     np.testing.assert_allclose(shown[:, :3], stacked(columns, "nx ny nz")[kept] / 2 + 0.5, atol=1e-6)
     compat.set_modifier_input(modifier, "Display", "Shaded")
-    mesh = evaluated_mesh(run.splats)
-    assert mesh.materials[mesh.polygons[0].material_index].name == "pot splats"
+    assert drawn_material(run.splats) == "pot splats"
 
 
 def test_normals_bend_as_a_sphere_does(tmp_path):
@@ -245,7 +265,7 @@ def test_one_splat_and_a_mesh_without_faces(run_folder, scene, tmp_path):
     write_ply(run_folder / "splats.ply", random_columns(1))
     trimesh.Scene(trimesh.PointCloud(np.eye(3))).export(run_folder / "mesh.glb")
     run = import_run(run_folder, scene)
-    assert len(run.splats.data.points) == len(evaluated_mesh(run.splats).polygons) == 1
+    assert len(run.splats.data.points) == len(drawn(run.splats, "opacity")) == 1
     assert [len(item.data.polygons) for item in run.mesh] == [0]
     (run_folder / "textures").mkdir()
     picture = bpy.data.images.new("picture", 4, 4)
