@@ -1,5 +1,6 @@
 """Read a splats.ply, and make a Blender point cloud of it. Each splat is a point with its material as attributes."""
 
+import itertools
 import re
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -37,6 +38,7 @@ _SPLATS = re.compile(
     r"|ori_color_[012]|refl_strength"
 )
 _ROWS = 4096  # rows at a time, to fit the processor's cache
+_SPLATS_AT_A_TIME = 16384  # likewise
 
 
 def add_splats(
@@ -58,9 +60,11 @@ def add_splats(
     material = splat_material(name, constants or {}, two_sided)
     cloud.materials.append(material)
     modifier = result.modifiers.new(NAME, "NODES")
+    modifier.show_viewport = False  # not to be evaluated yet, which takes a second for a million splats
     modifier.node_group = splats_tree(values_material())
     bpy.context.view_layer.update()  # 5.2 creates the modifier's inputs here
     compat.set_modifier_input(modifier, "Material", material)
+    modifier.show_viewport = True
     return result
 
 
@@ -279,6 +283,9 @@ def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
     beside = np.sort(beside, axis=0)[len(orders) - 1]  # curves jump: ignore the largest distances
     reach = np.maximum(np.where(np.isfinite(beside), 64 * beside, 1), 1e-24)
 
+    def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
     def gather(order: np.ndarray) -> np.ndarray:
         """Compute the sums that each splat's least-squares fit needs, over the splat's neighbours along one curve. Returns (7, N).
 
@@ -286,18 +293,25 @@ def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
         w is the neighbour's weight. (u, v) is the offset to the neighbour, and (du, dv) the difference of the normals. Both are measured
         along the splat's two axes.
         """
-        place, facing_way, *axes, width = (values[order] for values in (position, normal, *tangents, reach))
+        place, facing_way, *axes = (np.take(values.T, order, axis=1) for values in (position, normal, *tangents))
+        width = reach[order]
         found = np.zeros((7, count), np.float32)
-        for steps in _STEPS:
-            ahead, behind = slice(None, -steps), slice(steps, None)
-            offset, change = (values[behind] - values[ahead] for values in (place, facing_way))
-            alike = np.einsum("na,na->n", facing_way[ahead], facing_way[behind]) > 0.5
-            squared = np.einsum("na,na->n", offset, offset)
+        for start, steps in itertools.product(range(0, count, _SPLATS_AT_A_TIME), _STEPS):
+            stop = min(start + _SPLATS_AT_A_TIME, count - steps)
+            if stop <= start:
+                continue
+            ahead, behind = slice(start, stop), slice(start + steps, stop + steps)
+            offset, change = (values[:, behind] - values[:, ahead] for values in (place, facing_way))
+            alike = dot(facing_way[:, ahead], facing_way[:, behind]) > 0.5
+            squared = dot(offset, offset)
             for end in (ahead, behind):  # from the other end offset and change both flip sign, their products do not
                 weight = np.exp(-0.5 * squared / width[end]) * alike
-                u, v, du, dv = (np.einsum("na,na->n", d, axis[end]) for d in (offset, change) for axis in axes)
-                for total, product in zip(found, (u * u, u * v, v * v, u * du, u * dv, v * du, v * dv), strict=True):
-                    total[end] += weight * product
+                u, v, du, dv = (dot(d, axis[:, end]) for d in (offset, change) for axis in axes)
+                wu, wv = weight * u, weight * v
+                for total, product in zip(
+                    found, (wu * u, wu * v, wv * v, wu * du, wu * dv, wv * du, wv * dv), strict=True
+                ):
+                    total[end] += product
         result = np.empty_like(found)
         result[:, order] = found
         return result
