@@ -46,4 +46,5 @@ def reckoned(points, normals, metal, metallic, by_object=False):
     fitted = torch.full((count, 3), 0.8), torch.full((count,), 0.2), torch.full((count,), by_object)
     graph = same_material.laplacian(points, seen, neighbours(points, NEIGHBOURS))
     known = torch.ones(count, dtype=torch.bool)
-    return reckoning.Reckoned(metal, activate(start), seen, seen.pixels, *fitted, graph, {}, known)
+    sums = torch.full((count, 3), 0.8), torch.ones(count, 3), torch.zeros(count, 1, dtype=torch.bool)
+    return reckoning.Reckoned(metal, activate(start), seen, seen.pixels, *fitted, *sums, graph, {}, known)

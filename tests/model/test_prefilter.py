@@ -80,6 +80,28 @@ def test_gradient_is_the_transpose(device):
     assert float((x.grad * other).sum()) == pytest.approx(float(change), rel=1e-4)
 
 
+def test_irradiance_teaches_only_the_texels_that_it_should(device):
+    """Check that only the gradient by irradiance, the last level, is masked. A lamp learns from it although mirrors tell its radiance."""
+    generator = torch.Generator().manual_seed(0)
+    radiance = torch.rand(6 * 16 * 16, 3, generator=generator)
+    radiance[5] = 3.0
+    weight = torch.rand(prefilter.prefilter(radiance, 16).shape, generator=generator)
+    told = torch.rand(6 * 8 * 8, generator=generator) < 0.5
+
+    def gradient(told, levels):
+        leaf = radiance.clone().to(device).requires_grad_()
+        light = Environment(leaf, told=None if told is None else told.to(device))
+        (light.levels[levels] * weight.to(device)[levels]).sum().backward()
+        return leaf.grad.cpu()
+
+    mirrored, diffuse = slice(-6 * 16**2), slice(-6 * 16**2, None)
+    torch.testing.assert_close(gradient(told, mirrored), gradient(None, mirrored))
+    fixed = told[cubemap.texels_at(cubemap.texel_directions(16), 8)]
+    fixed[5] = False
+    assert 0.3 < float(fixed.float().mean()) < 0.7
+    torch.testing.assert_close(gradient(told, diffuse), gradient(None, diffuse) * ~fixed[:, None])
+
+
 def test_irradiance_of_a_constant_and_of_a_cosine_sky():
     ones = Environment(torch.ones(6 * 16 * 16, 3))
     normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=-1)

@@ -1,5 +1,6 @@
 """Test that base colours start at what photos show, and are kept at what photos and experience tell."""
 
+import pytest
 import torch
 
 from refgs.model import cubemap
@@ -18,7 +19,7 @@ def ball(by_object):
     points, normals, metal = ball_on_board()
     found = reckoned(points, normals, metal.float(), metal.float(), True)
     which = metal & by_object(torch.arange(len(metal)))
-    return found._replace(by_object=which, reflectance=torch.where(which[:, None], 0.8, 0.1).expand(-1, 3)), metal
+    return found._replace(by_object=which, reflected=torch.where(which[:, None], 0.8, 0.1).expand(-1, 3)), metal
 
 
 def metal_and_paint(folder, capture, albedo, every=3):
@@ -37,6 +38,27 @@ def test_a_few_surfels_that_mirror_the_object_tell_of_their_piece():
     told = base_colors.told(found, metal)
     assert torch.allclose(told[metal, :3], torch.tensor(0.8), atol=1e-3) and bool((told[metal, 3] > 0.1).all())
     assert float(told[~metal, 3].median()) < 0.1, "the board is another piece"
+
+
+def test_wrong_normals_do_not_darken_what_metals_tell():
+    """Check a metal of 0.8 some of whose surfels mirror bright points, where their rays meet dark ones, and some the other way round."""
+    found, metal = ball(lambda i: i >= 0)
+    bright = torch.where(torch.rand(len(metal), 2, generator=torch.Generator().manual_seed(0)) < 0.5, 0.1, 1.0)
+    reflected, white = (each[:, None].expand(-1, 3) for each in (0.8 * bright[:, 0], bright[:, 1]))
+    told = base_colors.told(found._replace(reflected=reflected, white=white), metal)
+    assert torch.allclose(told[metal, :3], torch.tensor(0.8), atol=0.15)
+    assert float(told[metal, :3].mean()) == pytest.approx(0.8, abs=0.03)
+
+
+def test_mirrors_tell_the_light_that_they_face():
+    """Check a ball whose camera sees each surfel from the front: it tells the light in all directions, or above, if it mirrors the rest."""
+    found, metal = ball(lambda i: i >= 0)
+    above = cubemap.texel_directions(base_colors.TOLD_SIDE)[:, 2]
+    told = base_colors.told_light(found, metal)
+    assert float(told[above > -0.8].float().mean()) > 0.85 and not told[above < -0.98].any()
+    assert not base_colors.told_light(found, metal & False).any()
+    told = base_colors.told_light(found._replace(met=(found.seen.normal[..., 2] < 0)), metal)
+    assert not told[above < -0.1].any() and float(told[above > 0.1].float().mean()) > 0.85
 
 
 def test_metals_that_mirror_no_object_are_left_alone():
@@ -61,6 +83,22 @@ def test_metals_are_drawn_to_what_they_show(large_ball, tmp_path):
     again = small(large_ball, tmp_path / "again", total=400).state
     snapshot.restore(again, state.folder)
     assert torch.equal(again.learned["shown_color"], state.learned["shown_color"])
+
+
+def test_later_metals_keep_their_level_and_learn_patterns(large_ball, tmp_path):
+    state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.3, 0.3, 0.3]))
+    pattern = torch.where(torch.arange(len(metal)) % 2 > 0, 0.2, 0.4)[:, None].expand(-1, 3)
+    state.learned["albedo"].data.copy_(pattern.logit())
+    state.learned["shown_color"].data.copy_(torch.tensor([0.6, 0.6, 0.6, 1.0]).expand(len(metal), 4))
+    light = state.learned["environment"].detach().clone()
+    for _ in range(10):
+        do(state, "level metals' base colours", 0.8, done=320)
+    now = state.surfels().albedo.detach()
+    ratio = now[metal] / pattern[metal]
+    assert torch.allclose(ratio, ratio.mean().expand_as(ratio), rtol=1e-3) and float(now[metal].log().mean().exp()) == (
+        pytest.approx(0.6, rel=0.01)
+    )
+    assert torch.allclose(now[~metal], pattern[~metal], atol=1e-5) and torch.equal(state.learned["environment"], light)
 
 
 def test_neighbouring_paint_is_averaged_but_not_with_metal(large_ball, tmp_path):
@@ -111,6 +149,7 @@ def test_base_colours_stay_below_one(large_ball, tmp_path):
     put(made, albedo=torch.tensor([20.0, 0.0, -40.0]), metallic=raw_metallic(0.98), told=True)
     metal = torch.ones(state.learned.count, dtype=torch.bool)
     state.learned["shown_color"].data.fill_(1.0)
+    base_colors.level(state, metal)
     base_colors.keep(state, metal, ~metal)
     assert bool(state.learned["albedo"].isfinite().all()) and float(state.surfels().albedo.detach().max()) <= 0.981
 

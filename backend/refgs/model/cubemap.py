@@ -80,6 +80,19 @@ def orbits(resolution: int) -> Tensor:
     return texel.permute(t, s, axis, z, y, x).reshape(-1, SYMMETRIES)
 
 
+def texels_at(directions: Tensor, side: int) -> Tensor:
+    """Return the indices (P,) of the texels at directions (P, 3), of a cubemap with `side` texels a side."""
+    face, s, t = face_coordinates(directions)
+    column, row = (((x + 1) / 2 * side).long().clamp(0, side - 1) for x in (s, t))
+    return (face * side + row) * side + column
+
+
+@lru_cache(maxsize=4)
+def texels_in(side: int, coarse: int, device: torch.device) -> Tensor:
+    """Return for each texel (6·side²,) of a cubemap the index of the texel around it, of a cubemap with `coarse` texels a side."""
+    return texels_at(texel_directions(side), coarse).to(device)
+
+
 @lru_cache(maxsize=8)
 def orbit_order(sides: tuple[int, ...]) -> Tensor:
     """Return the indices (Σ 6·side²,) that sort the texels of stacked cubemaps by orbits.

@@ -11,6 +11,8 @@ from refgs.formats.panorama import directions as panorama_directions
 from refgs.formats.panorama import sample as sample_panorama
 from refgs.model import cubemap, harmonics, prefilter
 
+CLIPPED = 1.0  # radiance from which on photos may clip what mirrors it: a lamp's
+
 
 def turn_between(camera: Camera, reference: Camera) -> np.ndarray:
     """Return the rotation (3, 3) about world z from `camera`'s heading to `reference`'s."""
@@ -25,13 +27,19 @@ class Environment:
     Without a `reference` camera, the light is fixed in the world. With a `reference`, it rotates about the world's z axis together with the
     rendering camera, as if the object stood on a turntable before a fixed camera. `radiance` is then the light for the reference camera.
     The light never tilts, because lamps stay where they are when a photo is taken from higher up.
+
+    `told` marks texels, of any resolution, whose radiance mirrors tell. Irradiance teaches them nothing, unless they are lamps.
     """
 
-    def __init__(self, radiance: Tensor, reference: Camera | None = None):
+    def __init__(self, radiance: Tensor, reference: Camera | None = None, told: Tensor | None = None):
         self.radiance, self.reference = radiance, reference
         self.resolution = math.isqrt(len(radiance) // 6)
         self.sides = tuple(prefilter.level_sides(self.resolution))
-        self.levels = prefilter.prefilter(radiance, self.resolution)
+        taught = None
+        if told is not None:
+            texel = cubemap.texels_in(self.resolution, math.isqrt(len(told) // 6), told.device)
+            taught = ~told[texel] | (radiance.detach().amax(dim=1) > CLIPPED)
+        self.levels = prefilter.prefilter(radiance, self.resolution, taught)
 
     @property
     def harmonics(self) -> Tensor:

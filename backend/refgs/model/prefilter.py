@@ -178,6 +178,16 @@ def matrices(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
 
 
 @lru_cache(maxsize=4)
+def _of_irradiance(resolution: int, device: torch.device) -> Matrix:
+    """Return the transpose of the sparse matrix from the pyramid to irradiance, the last level."""
+    side = level_sides(resolution)[-1]
+    shape = sum(n * n // 4 for n in _pyramid_sides(resolution)), side * side // 4
+    weights = _level_weights(resolution, side, cosine_lobe, coarsest=side)
+    transpose, _ = _matrix_and_transpose(shape, *weights, device)
+    return transpose
+
+
+@lru_cache(maxsize=4)
 def _pyramid(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
     """Return the sparse matrix from a cubemap to its pyramid of mips, and its transpose."""
     mip = sparse.identity(resolution**2 // 4, format="csr")
@@ -215,8 +225,8 @@ def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tenso
 @timed("prefilter")
 class _Prefilter(Function):
     @staticmethod
-    def forward(ctx, radiance: Tensor, resolution: int) -> Tensor:
-        ctx.resolution, device = resolution, radiance.device
+    def forward(ctx, radiance: Tensor, resolution: int, taught: Tensor | None) -> Tensor:
+        ctx.resolution, ctx.taught, device = resolution, taught, radiance.device
         ordered = radiance.index_select(0, _order(resolution, device))
         pyramid = _product(_pyramid(resolution, device)[0], ordered)
         return _product(matrices(resolution, device)[0], pyramid)
@@ -225,18 +235,25 @@ class _Prefilter(Function):
     @once_differentiable
     def backward(ctx, by_levels: Tensor):
         resolution, device = ctx.resolution, by_levels.device
-        by_pyramid = _product(matrices(resolution, device)[1], by_levels.contiguous())
-        return _product(_pyramid(resolution, device)[1], by_pyramid, rows=_order(resolution, device)), None
+        by_levels, pyramid, order = by_levels.contiguous(), _pyramid(resolution, device)[1], _order(resolution, device)
+        by_radiance = _product(pyramid, _product(matrices(resolution, device)[1], by_levels), rows=order)
+        if ctx.taught is not None:
+            last = by_levels[-6 * level_sides(resolution)[-1] ** 2 :]
+            by_irradiance = _product(pyramid, _product(_of_irradiance(resolution, device), last), rows=order)
+            by_radiance -= by_irradiance * ~ctx.taught[:, None]
+        return by_radiance, None, None
 
 
-def prefilter(radiance: Tensor, resolution: int) -> Tensor:
+def prefilter(radiance: Tensor, resolution: int, taught: Tensor | None = None) -> Tensor:
     """Prefilter a cubemap (6·R², 3) of linear radiance for each of `ROUGHNESS`.
 
     Returns the levels stacked, (Σ 6·side², 3); `level_sides` gives their sides. The last level is irradiance / π. The texels of each level
     are in orbit order; `cubemap.in_texel_order` reorders them by face, row, column.
+
+    The mask `taught` (6·R²,) selects the texels that get a gradient from irradiance. Without it, all do.
     """
     check(radiance=(radiance, (6 * resolution**2, 3)))
-    return _Prefilter.apply(radiance, resolution)
+    return _Prefilter.apply(radiance, resolution, taught)
 
 
 def irradiance(levels: Tensor, sides: tuple[int, ...], normals: Tensor) -> Tensor:

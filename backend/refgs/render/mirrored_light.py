@@ -35,17 +35,10 @@ def mirrored_light(
         lit = stack(channels(surfels, camera, settings, indirect=True))
         features, _, alpha = rasterize(*discs(surfels, camera), lit, camera, near=near)
         turn = torch.from_numpy(light.turn(camera)).float().T
-        seen = _texels_at(mirror_directions(features, alpha, camera)[alpha > SOLID].cpu() @ turn)
+        seen = cubemap.texels_at(mirror_directions(features, alpha, camera)[alpha > SOLID].cpu() @ turn, SIDE)
         pixels += torch.bincount(seen, minlength=len(pixels))
-    part = _texels_at(cubemap.texel_directions(light.resolution).float())
+    part = cubemap.texels_in(light.resolution, SIDE, pixels.device)
     weights = (pixels / torch.bincount(part, minlength=len(pixels)).clamp_min(1))[part]
     if not pixels.any():
         weights = cubemap.texel_solid_angles(light.resolution).float()
     return (weights / weights.sum()).to(light.radiance.device)
-
-
-def _texels_at(directions: Tensor) -> Tensor:
-    """Return texel indices of directions (P, 3) on a cubemap with SIDE texels a side."""
-    face, s, t = cubemap.face_coordinates(directions)
-    column, row = (((x + 1) / 2 * SIDE).long().clamp(0, SIDE - 1) for x in (s, t))
-    return (face * SIDE + row) * SIDE + column

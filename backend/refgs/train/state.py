@@ -78,6 +78,7 @@ class State:
         self.residual = False  # the residual learns (see `residual_start`)
         self.learned = Learned()  # surfels, "environment" (raw texels of the light), and "exposure" (one row a view)
         self.occluder: Occluder | None = None
+        self.told_light: Tensor | None = None  # which texels of the light metals mirror (see `Environment`)
         self.parts: dict[type, Any] = {}
 
     def part(self, kind: type[P]) -> P:
@@ -143,7 +144,8 @@ class State:
         if not self.method.lit:
             return None
         reference = self.views[0].camera if self.settings.light.frame == "camera" else None
-        return Environment(self.method.light.radiance(self.learned["environment"]), reference)
+        radiance = self.method.light.radiance(self.learned["environment"])
+        return Environment(radiance, reference, self.told_light)
 
     def inputs(self) -> RenderInputs:
         """Gather the surfels, light, settings and mesh for a rendering."""

@@ -292,6 +292,7 @@ AFTER = (
     DECIDE("find metals", part_after_initial(0.1) & iteration(100), RESIDUAL, only_if=METALS),
     Row("judge metals", until=RESIDUAL, only_if=JUDGED & FROM_HULL & METALS, clock="deciding"),
     Row("even coloured metal out", None, part(0.6), iterations(50)),
+    Row("level metals' base colours", every=iterations(10)),
     Row("keep base colours", None, part(0.6), iterations(10)),
     Row("average paint's base colours", None, part(0.6), share(1 / 50)),
     Row("prune and divide surfels", setting("densify.start"), None, period("densify.every"), PRUNABLE),

@@ -50,6 +50,7 @@ ACTIONS: dict[str, Callable[[State, Step], object]] = {
     "find metals": metals.find_metals,
     "judge metals": metals.judge,
     "even coloured metal out": even_metal.even_out,
+    "level metals' base colours": metals.level_metals,
     "keep base colours": metals.keep_base_colors,
     "average paint's base colours": metals.average_paint,
     "prune and divide surfels": densify.prune_and_divide,

@@ -59,7 +59,7 @@ class Specular(Need):
 
     def apply(self, state: State, found: Found) -> None:
         state.change("render.reflection", "none", "needs", found.why)
-        state.occluder = None
+        state.occluder = state.told_light = None
         state.learned.drop("metallic", "roughness", "held", "told", "shown_color", *INDIRECT)
 
     def undo(self, state: State, why: str) -> None:

@@ -2,19 +2,20 @@
 
 Photos of a mirror do not tell its base colour from the light: twice the light and half of the base colour look the same, and so do a red
 light and a bluish base colour. The light is free wherever only one surfel mirrors it, and lamps, which photos clip, are free everywhere.
-Surfels learn faster than the light, so errors of the light and shades of the surface ended in base colours. Four steps prevent that:
+Surfels learn faster than the light, so errors of the light and shades of the surface ended in base colours. And paint needs light: rather
+than few lamps, a thousand dark texels became a little brighter. Six steps prevent that:
 
 - Base colours start at what photos show (`start`), not at grey: else the light takes the object's colour.
 - A metal's base colour is drawn to what it shows of the object, divided by what photos show there (`told`). That needs no light. It is one
   colour for a piece (`same_material`).
+- Metals keep their mean base colour (`level`), to the end.
+- What metals mirror of the light is told by them (`told_light`): what lights paint no longer changes it. Only lamps do more for paint.
 - The base colour of paint is averaged over neighbours (`average`), so that the light, not the paint, learns shades.
 - Lamps have the colour, and together with paint the brightness, that experience tells (`_balance`).
 
-The last three are done until 60 % of the training, and only where photos tell the base colour of a metal: elsewhere the light is not known.
-Later, base colours are free: photos add patterns and stains.
+All but the first are only done where photos tell the base colour of a metal: elsewhere the light is not known. Metals are drawn, paint is
+averaged and lamps are balanced until 60 % of the training. Later, base colours are free: photos add patterns and stains.
 """
-
-import math
 
 import numpy as np
 import torch
@@ -23,8 +24,9 @@ from torch import Tensor
 from refgs.capture import LoadedView
 from refgs.color import srgb_decode
 from refgs.geometry.project import inside, project, sample
+from refgs.geometry.visibility import mirror
 from refgs.model import cubemap
-from refgs.model.environment import Environment
+from refgs.model.environment import CLIPPED, Environment
 from refgs.spread import spread
 from refgs.train.learn import light
 from refgs.train.material import same_material
@@ -37,9 +39,11 @@ DRAWN = 0.3  # part of the way to the told base colour, each time
 LEAST_KNOWN = 0.02  # less spreads from afar
 LEAST_PART = 0.05  # fraction of the metals' pixels from which on what they mirror of the object tells
 AVERAGED = 64  # neighbours
-# The most that all paint of a capture has in the mean: the brightest channel, as a logarithm. In 30 rendered scenes, the true means are
-# 0.25 times or over 1.9, and photographers expose for 0.18.
-PAINT = 0.4
+PAINT = (
+    0.35  # the most that the brightest channel of all paint has in the mean; the median of 34 rendered scenes is 0.34
+)
+TOLD_SIDE = 16  # texels along a side of the coarse cubemap in which mirrored directions are counted
+LEAST_MIRRORED = 2.0  # pixels that must mirror one of its texels, so that they tell its radiance
 STEP, MOST_STEP = 0.1, 0.05  # part of the way to balance, each time, and the largest step: logarithms
 
 
@@ -81,27 +85,53 @@ def _shown(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray) 
 def told(found: Reckoned, metals: Tensor) -> Tensor:
     """Return what photos tell of base colours of metal, (N, 4): the linear colour, and how much is known of it, from 0 to 1.
 
-    A metal's reflectance is known where it mirrors the object. It spreads over the piece, as a mean of logarithms. If too little of the
-    `metals` (N,) mirrors the object, nothing is known.
+    A metal's reflectance is known where it mirrors the object. What is reflected there, and what a metal of reflectance 1 would reflect,
+    spread over the piece. Their ratio is the colour: where normals err, single ratios are too low. If too little of the `metals` (N,)
+    mirrors the object, nothing is known.
     """
     pixels = found.pixels * metals
     if (pixels * found.by_object).sum() <= LEAST_PART * pixels.sum():
         return torch.zeros(len(metals), 4)
     weight = found.by_object * (2 * found.metal - 1).clamp_min(0)
-    values = torch.cat([plausible(found.reflectance).log(), torch.ones_like(weight)[:, None]], dim=1)
+    values = torch.cat([found.reflected, found.white, torch.ones_like(weight)[:, None]], dim=1)
     *sums, known = (same_material.spread(found.graph, each, weight) for each in values.T)
-    color = (torch.stack(sums, dim=1) / known.clamp_min(LEAST_KNOWN)[:, None]).exp()
-    return torch.cat([plausible(color), known.clamp(0, 1)[:, None]], dim=1) * (known > LEAST_KNOWN)[:, None]
+    reflected, white = torch.stack(sums, dim=1).clamp_min(1e-6).split(3, dim=1)
+    return torch.cat([plausible(reflected / white), known.clamp(0, 1)[:, None]], dim=1) * (known > LEAST_KNOWN)[:, None]
+
+
+def told_light(found: Reckoned, metals: Tensor) -> Tensor:
+    """Tell which texels (6·TOLD_SIDE²,) of the light photos show in `metals` (N,)."""
+    seen, pixels = found.seen, torch.zeros(6 * TOLD_SIDE**2)
+    for view in range(seen.weight.shape[1]):
+        shows = metals & (seen.weight[:, view] > 0) & ~found.met[:, view]
+        directions = mirror(-seen.towards[shows, view], seen.normal[shows, view])
+        pixels.index_add_(0, cubemap.texels_at(directions, TOLD_SIDE), seen.weight[shows, view])
+    return pixels > LEAST_MIRRORED
+
+
+@torch.no_grad()
+def level(state: State, metals: Tensor) -> None:
+    """Keep the mean base colour of `metals` (N,) at what photos tell. Differences between them can learn."""
+    raw = state.learned["albedo"]
+    logs, wrong, weight = _wrong(state, metals)
+    mean = (weight * wrong).sum(dim=0) / weight.sum().clamp_min(1e-6)
+    raw.copy_(torch.where(weight > 0, torch.logit(plausible((logs + mean).exp())), raw))
 
 
 @torch.no_grad()
 def keep(state: State, metals: Tensor, paint: Tensor) -> None:
     """Draw base colours of `metals` (N,) to what photos tell, and balance lamps with `paint` (N,)."""
-    raw, (color, known) = state.learned["albedo"], state.learned["shown_color"].split([3, 1], dim=1)
-    logs = plausible(raw.sigmoid()).log()
-    drawn = DRAWN * known * (plausible(color).log() - logs)
-    logs = logs + metals[:, None] * drawn + paint[:, None] * _balance(state, logs, paint)
+    raw = state.learned["albedo"]
+    logs, wrong, weight = _wrong(state, metals)
+    logs = logs + DRAWN * weight * wrong + paint[:, None] * _balance(state, logs, paint)
     raw.copy_(torch.where((metals | paint)[:, None], torch.logit(plausible(logs.exp())), raw))
+
+
+def _wrong(state: State, metals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return logarithms of base colours (N, 3), how far `metals` (N,) are from what photos tell, and how much is known of that (N, 1)."""
+    color, known = state.learned["shown_color"].split([3, 1], dim=1)
+    logs = plausible(state.learned["albedo"].sigmoid()).log()
+    return logs, plausible(color).log() - logs, metals[:, None] * known
 
 
 @torch.no_grad()
@@ -117,16 +147,18 @@ def average(state: State, paint: Tensor) -> None:
 def _balance(state: State, logs: Tensor, paint: Tensor) -> Tensor:
     """Change lamps' radiance a little, and return the change (3,) of paint's base colours that makes up for it, as a logarithm.
 
-    `logs` (N, 3) are logarithms of base colours. Texels whose radiance exceeds 1 are lamps: photos clip what mirrors them. Photos are
-    balanced to white, so the light as a whole is drawn to grey. The smaller the part of lamps is, the less changes.
+    `logs` (N, 3) are logarithms of base colours. Photos are balanced to white, so the light as a whole is drawn to grey. The smaller the
+    part of lamps is, the less changes.
     """
     radiance = state.method.light.radiance(state.learned["environment"])
     environment = Environment(radiance)
     power = radiance * cubemap.texel_solid_angles(environment.resolution).to(radiance).view(-1, 1)
-    whole, lamps = power.sum(dim=0), radiance > 1
+    whole, lamps = power.sum(dim=0), radiance > CLIPPED
     part = (power * lamps).sum(dim=0) / whole
-    mean = (logs.amax(dim=1) * paint).sum() / paint.sum().clamp_min(1)
-    wanted = (math.log(PAINT) - mean).clamp_max(0) + whole.log() - whole.log().mean()
+    surfels = state.surfels()
+    area = paint * surfels.opacities * surfels.scales.prod(dim=1)
+    mean = (logs.amax(dim=1).exp() * area).sum() / area.sum().clamp_min(1e-30)
+    wanted = (PAINT / mean.clamp_min(DARKEST)).log().clamp_max(0) + whole.log() - whole.log().mean()
     step = part * (STEP * wanted).clamp(-MOST_STEP, MOST_STEP)
     brighter = 1 + ((-step).exp() - 1) / part.clamp_min(1e-6)
     raw = state.learned["environment"]

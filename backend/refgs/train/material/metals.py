@@ -6,7 +6,8 @@ at some new meshes. Where photos are sure, metallic values do not learn in betwe
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import torch
 
@@ -14,7 +15,7 @@ from refgs.model.surfels import raw_metallic
 from refgs.train.material import base_colors, questions
 from refgs.train.material.observe import Kinds
 from refgs.train.material.reckoning import like_metals, reckon
-from refgs.train.part import Part
+from refgs.train.part import Fact, Part
 from refgs.train.state import State
 from refgs.train.timeline import Step, metals_decidable
 
@@ -29,8 +30,9 @@ TOLD = 0.005  # a change of a larger fraction of the surface is announced
 class Metals(Part):
     """Remember whether metals have already been `found`, and whether they are `colored`: photos tell base colours of some that are sure.
 
-    Of each surfel, remember whether hints hold its kind (`held`), whether photos are sure of it (`told`), and the base colour that photos
-    tell of it, if it is metal (`shown_color`, see `base_colors.told`).
+    Without masks, they never are. Of each surfel, remember whether hints hold its kind (`held`), whether photos are sure of it (`told`),
+    and the base colour that photos tell of it, if it is metal (`shown_color`, see `base_colors.told`). Checkpoints also keep
+    `state.told_light`.
     """
 
     name, saved = "metals", ("found", "colored")
@@ -38,11 +40,20 @@ class Metals(Part):
 
     def start(self, state: State) -> None:
         self.found = self.colored = False
+        state.told_light = None
         if "metallic" in state.learned:
             state.learned.learn("shown_color", torch.zeros(state.learned.count, 4, device=state.device))
             for name in ("held", "told"):
                 none = torch.zeros(state.learned.count, dtype=torch.bool, device=state.device)
                 state.learned.learn(name, none)
+
+    def restore(self, state: State, facts: Mapping[str, Any]) -> None:
+        super().restore(state, facts)
+        state.told_light = facts.get("told_light")
+
+    def facts(self, state: State) -> dict[str, Fact]:
+        told = state.told_light
+        return super().facts(state) | ({} if told is None else {"told_light": told})
 
 
 def find_metals(state: State, step: Step) -> None:
@@ -81,7 +92,9 @@ def _judge(state: State, first: bool = False) -> None:
     state.learned["told"].copy_(metal | paint)
     shown = state.learned["shown_color"]
     shown.copy_(base_colors.told(found, _sure_kinds(state)[0].cpu()))
-    state.part(Metals).colored = bool(shown.any())
+    state.part(Metals).colored = state.from_hull and bool(shown.any())
+    light = base_colors.told_light(found, _sure_kinds(state)[0].cpu()).to(state.device)
+    state.told_light = light if state.part(Metals).colored else None
     if raised.any():
         material = torch.logit(base_colors.plausible(like_metals(found))).to(metallic.device)
         albedo[raised], roughness[raised] = material[raised, :3], material[raised, 3]
@@ -158,6 +171,12 @@ def keep_base_colors(state: State, step: Step) -> None:
         base_colors.keep(state, *_sure_kinds(state))
 
 
+def level_metals(state: State, step: Step) -> None:
+    """Keep the mean base colour of metals at what photos tell."""
+    if _base_colors_kept(state):
+        base_colors.level(state, _sure_kinds(state)[0])
+
+
 def average_paint(state: State, step: Step) -> None:
     """Average base colours of paint over neighbours, so that the light learns shades, and not the paint."""
     if _base_colors_kept(state):
@@ -165,8 +184,8 @@ def average_paint(state: State, step: Step) -> None:
 
 
 def _base_colors_kept(state: State) -> bool:
-    """Tell whether photos tell base colours of metals on an object that masks show, so that they tell the light."""
-    return state.part(Metals).colored and state.from_hull and {"albedo", "metallic"} <= state.learned.keys()
+    """Tell whether photos tell base colours of metals, so that they tell the light."""
+    return state.part(Metals).colored and {"albedo", "metallic"} <= state.learned.keys()
 
 
 def _sure_kinds(state: State) -> tuple[torch.Tensor, torch.Tensor]:

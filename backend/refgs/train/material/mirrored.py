@@ -39,8 +39,9 @@ class Fit(NamedTuple):
     - `reflectance` (N, 3), `roughness` (N,): values of the metal that fits best; its reflectance is a mean over the neighbours
     - `mirrored` (N,): the mean radiance that they mirror
     - `pixels` (N,): their pixels in these photos
-    - `level` (N, 3): what they show in all of these photos together, divided by what a metal of reflectance 1 would show. Where normals
-      err, `reflectance` is too low: surfels mirror other points than their rays meet. Together they mirror the same.
+    - `reflected`, `white` (N, 3): what they show in all of these photos together, and what a metal of reflectance 1 would show. Where
+      normals err, `reflectance` is too low: surfels mirror other points than their rays meet. Together they mirror the same, so that sums
+      tell more.
     """
 
     ratio: Tensor
@@ -48,18 +49,21 @@ class Fit(NamedTuple):
     roughness: Tensor
     mirrored: Tensor
     pixels: Tensor
-    level: Tensor
+    reflected: Tensor
+    white: Tensor
 
 
 class Mirrored(NamedTuple):
     """Hold the fits to all photos, and to those in which the mirror ray meets the object.
 
-    `radiance` (N, V) is what each surfel mirrors in each photo: the mean of the channels, at the roughness MIDDLE.
+    `radiance` (N, V) is what each surfel mirrors in each photo: the mean of the channels, at the roughness MIDDLE. `met` (N, V) tells
+    whether that is the object.
     """
 
     everywhere: Fit
     of_object: Fit
     radiance: Tensor
+    met: Tensor
 
 
 @torch.no_grad()
@@ -165,11 +169,10 @@ class _Sums:
         weight = sums["power"][rows] if by_power else total.expand(-1, 3)
         columns = reflectance[rows] * weight, weight, sums["shown"][rows], sums["light"][rows], light, total
         summed = pooled(torch.cat(columns, dim=1).float(), near)
-        chosen, weight, shown, full, light, pixels = summed.split([3, 3, 3, 3, 1, 1], dim=1)
+        chosen, weight, shown, white, light, pixels = summed.split([3, 3, 3, 3, 1, 1], dim=1)
         chosen, light = chosen / weight.clamp_min(1e-12), light / pixels.clamp_min(1e-6)
-        level = (shown / full.clamp_min(1e-6)).clamp(0, 1)
         rough = torch.tensor(self._roughnesses)[best]
-        values = ratio.clamp_min(1e-12).log(), chosen, rough, light[:, 0], pixels[:, 0], level
+        values = ratio.clamp_min(1e-12).log(), chosen, rough, light[:, 0], pixels[:, 0], shown, white
         return Fit(*(each.float() for each in values))
 
 
@@ -179,11 +182,13 @@ def fit_both(seen: Seen, mirrored: Iterable[tuple[list[Tensor], Tensor]], near: 
     `mirrored` are the yields of `_mirrored`. `near` (N, K) are the neighbours to average over.
     """
     # The radiance of the object is not blurred, so that one roughness is enough there.
-    everywhere, of_object, radiance = _Sums(len(near), ROUGHNESSES), _Sums(len(near), ROUGHNESSES[:1]), []
+    everywhere, of_object, radiance, all_met = _Sums(len(near), ROUGHNESSES), _Sums(len(near), ROUGHNESSES[:1]), [], []
     for view, (lights, met) in enumerate(mirrored):
         weight, shown = seen.weight[:, view], seen.radiance[:, view]
         cosine = (seen.normal[:, view] * seen.towards[:, view]).sum(dim=1).clamp(GRAZING, 1)
         everywhere.add(weight, shown, lights, cosine)
         of_object.add(weight * met, shown, lights, cosine)
         radiance.append(lights[MIDDLE].mean(dim=1))
-    return Mirrored(everywhere.fit(near, False), of_object.fit(near, True), torch.stack(radiance, dim=1))
+        all_met.append(met)
+    views = (torch.stack(each, dim=1) for each in (radiance, all_met))
+    return Mirrored(everywhere.fit(near, False), of_object.fit(near, True), *views)

@@ -58,6 +58,8 @@ class Reckoned(NamedTuple):
     - `pixels` (N,): how much each surfel counts for shares of the surface: its pixels in these photos, 0 beyond the region to train
     - `reflectance` (N, 3), `roughness` (N,): values of the metal that explains the photos best
     - `by_object` (N,): whether the reflectance follows from what photos show of the object, so that it does not depend on the light
+    - `reflected`, `white` (N, 3): see `mirrored.Fit`, by the photos in which surfels mirror the object
+    - `met` (N, V): whether a surfel mirrors the object in a photo
     - `graph`: the Laplacian of neighbouring surfels (`same_material.laplacian`)
     - `terms`: see WEIGHTS, (N,) each, before they are spread
     - `known` (N,): whether photos show the surfel and its neighbours well enough for terms
@@ -70,6 +72,9 @@ class Reckoned(NamedTuple):
     reflectance: Tensor
     roughness: Tensor
     by_object: Tensor
+    reflected: Tensor
+    white: Tensor
+    met: Tensor
     graph: sparse.csr_matrix
     terms: dict[str, Tensor]
     known: Tensor
@@ -95,10 +100,12 @@ def reckon(state: State) -> Reckoned:
     known = (seen.pixels > same_material.FRINGE) & (every.pixels > ENOUGH_PIXELS)
     metal = same_material.spread(graph, log_odds(values), known.float()).sigmoid()
     by_object = (of_object.pixels > ENOUGH_PIXELS) & (of_object.mirrored > LEAST_SHOWN)
-    reflectance = torch.where(by_object[:, None], of_object.level, every.reflectance)
+    level = (of_object.reflected / of_object.white.clamp_min(1e-6)).clamp(0, 1)
+    reflectance = torch.where(by_object[:, None], level, every.reflectance)
     roughness = torch.where(by_object, of_object.roughness, every.roughness)
     pixels = seen.pixels * state.wanted().cpu()
-    return Reckoned(metal, surfels, seen, pixels, reflectance, roughness, by_object, graph, values, known)
+    sums = of_object.reflected, of_object.white, fits.met
+    return Reckoned(metal, surfels, seen, pixels, reflectance, roughness, by_object, *sums, graph, values, known)
 
 
 def log_odds(values: dict[str, Tensor]) -> Tensor:
