@@ -40,7 +40,7 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 @timed("visibility")
 def _visibility(
-    features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, occluder: Occluder, relit: Relit | None
+    features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, occluder: Occluder, relit: Relit | None = None
 ) -> Tensor:
     """Return 0 (H, W) where the object blocks a pixel's mirror ray, else 1.
 
