@@ -91,11 +91,11 @@ def _picture(state: State, found: Reckoned, members: Tensor) -> np.ndarray:
 
     shares = {view: shown(view) for view in probe.spread_views(state)}
     view = max(shares, key=lambda view: float(shares[view].sum()))
-    piece = (shares[view] > 0.5).numpy(force=True)
-    rows, columns = (_around(piece.any(axis=axis), size) for axis, size in ((1, piece.shape[0]), (0, piece.shape[1])))
+    piece = shares[view] > 0.5
+    rows, columns = (_around(piece.any(dim=1 - axis).numpy(force=True), size) for axis, size in enumerate(piece.shape))
     photo = state.photo(view, whole=True).over(state.background).numpy(force=True)
     panels = [as_bytes(photo[rows, columns])]
-    inside = piece[rows, columns]
+    inside = piece[rows, columns].numpy(force=True)
     edge = inside & ~(np.roll(inside, 1, 0) & np.roll(inside, -1, 0) & np.roll(inside, 1, 1) & np.roll(inside, -1, 1))
     panels[0][edge] = OUTLINE
     for kind in either:
