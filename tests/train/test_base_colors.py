@@ -5,6 +5,7 @@ import torch
 
 from refgs.model import cubemap
 from refgs.model.surfels import raw_metallic
+from refgs.render.mirrored_light import SIDE
 from refgs.train.keep import snapshot
 from refgs.train.material import base_colors, metals
 from tests.makers.pieces import ball_on_board, reckoned
@@ -28,8 +29,8 @@ def metal_and_paint(folder, capture, albedo, every=3):
     count = made.state.learned.count
     metal = torch.arange(count) % every > 0
     put(made, albedo=albedo.logit(), metallic=torch.where(metal, raw_metallic(0.98), raw_metallic(0.02)), told=True)
-    part = made.state.part(metals.Metals)
-    part.found = part.colored = True
+    made.state.part(metals.Metals).found = True
+    made.state.told_light = torch.zeros(6 * SIDE**2, dtype=torch.bool)
     return made.state, metal
 
 
@@ -53,7 +54,7 @@ def test_wrong_normals_do_not_darken_what_metals_tell():
 def test_mirrors_tell_the_light_that_they_face():
     """Check a ball whose camera sees each surfel from the front: it tells the light in all directions, or above, if it mirrors the rest."""
     found, metal = ball(lambda i: i >= 0)
-    above = cubemap.texel_directions(base_colors.TOLD_SIDE)[:, 2]
+    above = cubemap.texel_directions(SIDE)[:, 2]
     told = base_colors.told_light(found, metal)
     assert float(told[above > -0.8].float().mean()) > 0.85 and not told[above < -0.98].any()
     assert not base_colors.told_light(found, metal & False).any()

@@ -85,7 +85,8 @@ def test_surfels_start_in_the_box_and_around_it(balls, tmp_path):
     inside = state.wanted()
     assert 0.5 <= inside.float().mean() < 1 and len(inside) <= 1500
     if state.from_hull:
-        parameters, shown, *_ = start_parameters(state.capture, state.views, state.settings)
+        start = start_parameters(state.capture, state.views, state.settings)
+        parameters, shown = start.parameters, start.on_hull
         faint = parameters["opacity"].sigmoid() < 0.2
         assert faint[shown:].all() and not faint[:shown].any() and 0.3 < shown / len(faint) < 0.7
 

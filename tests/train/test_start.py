@@ -23,7 +23,8 @@ def start(folder, points: int, count: int = 1000):
         capture, points=rng.normal(size=(points, 3)), point_colors=np.full((points, 3), [1.0, 0.5, 0.0])
     )
     views = [load_view(view) for view in capture.views]
-    parameters, _, said, _ = start_parameters(capture, views, load_settings("quick", [f"surfels.start={count}"]))
+    start = start_parameters(capture, views, load_settings("quick", [f"surfels.start={count}"]))
+    parameters, said = start.parameters, start.said
     position = parameters["position"].detach().numpy()
     assert all(p.isfinite().all() for p in parameters.values())
     assert parameters["opacity"].sigmoid().max() <= FAINT + 1e-6

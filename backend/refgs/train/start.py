@@ -16,25 +16,30 @@ FAINT = 0.1  # largest opacity of points that may not lie on the surface
 
 
 class Start(NamedTuple):
-    """Hold the initial `parameters` of the surfels, and the `points` at which they start.
-
-    The first `on_hull` surfels lie on the visual hull; without a hull, all are counted. `said` tells the user where the surfels start.
-    """
+    """Hold the initial `parameters` of the surfels, and the `points` at which they start."""
 
     parameters: Parameters
-    on_hull: int
-    said: str
     points: FirstPoints
+
+    @property
+    def on_hull(self) -> int:
+        """Count the surfels on the visual hull, which come first. Without a hull, count all."""
+        return len(self.points.positions) if self.points.on_hull is None else self.points.on_hull
+
+    @property
+    def said(self) -> str:
+        """Tell the user where the surfels start."""
+        return f"{len(self.points.positions)} surfels start on {self.points.source}"
 
 
 def start_parameters(capture: Capture, views: list[LoadedView], settings: Settings, hollows: bool = False) -> Start:
     """Make the initial parameters of the surfels. `first_points` chooses their positions; `hollows` is passed on to it."""
     points = first_points(capture, views, settings.surfels, settings.train.seed, hollows)
-    shown = len(points.positions) if points.on_hull is None else points.on_hull
     opacity = settings.surfels.opacity
     parameters = _initial(points, settings.surfels, min(opacity, FAINT) if points.on_hull is None else opacity)
-    parameters["opacity"].data[shown:].clamp_(max=math.log(FAINT / (1 - FAINT)))
-    return Start(parameters, shown, f"{len(points.positions)} surfels start on {points.source}", points)
+    start = Start(parameters, points)
+    parameters["opacity"].data[start.on_hull :].clamp_(max=math.log(FAINT / (1 - FAINT)))
+    return start
 
 
 def start_appearance(settings: Settings) -> Parameters:

@@ -108,7 +108,7 @@ class Trainer:
         state = self.state
         inputs, step.photo = state.inputs(), coarse.photo(state, step.view, WHOLE.due(state, step))
         step.rendering = state.picture(inputs, step.photo.camera, exposures.exposure(state, step.view))
-        mean = None if state.part(metals.Metals).colored else light.mean_radiance(state, inputs.environment)
+        mean = light.mean_radiance(state, inputs.environment) if state.told_light is None else None
         loss, square = objective(step.rendering, mean, step.photo, state.background, state.losses, step.progress)
         if "exposure" in state.learned:
             loss = loss + state.settings.loss.exposure * departure(state.learned["exposure"][step.view])

@@ -43,7 +43,7 @@ def as_of_today(
     known = {"spent": facts.get("seconds", 0.0), "processor_seconds": 0.0, "decided": {}, "needs": {}} | facts
     known |= {"residual": harmonics is not None and bool(harmonics.any()), "clock": facts.get("parts", {})}
     known["parts"] = {
-        "metals": {"found": facts.get("metals_set", True), "colored": False},
+        "metals": {"found": facts.get("metals_set", True)},
         "poses": {"judged": facts.get("poses_judged", True)},
         "coarse": {"factor": facts.get("reduced", 1)},
     }

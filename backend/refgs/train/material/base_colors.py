@@ -17,6 +17,8 @@ All but the first are only done where photos tell the base colour of a metal: el
 averaged and lamps are balanced until 60 % of the training. Later, base colours are free: photos add patterns and stains.
 """
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -26,7 +28,8 @@ from refgs.color import srgb_decode
 from refgs.geometry.project import inside, project, sample
 from refgs.geometry.visibility import mirror
 from refgs.model import cubemap
-from refgs.model.environment import CLIPPED, Environment
+from refgs.model.environment import CLIPPED
+from refgs.render.mirrored_light import SIDE
 from refgs.spread import spread
 from refgs.train.learn import light
 from refgs.train.material import same_material
@@ -39,11 +42,8 @@ DRAWN = 0.3  # part of the way to the told base colour, each time
 LEAST_KNOWN = 0.02  # less spreads from afar
 LEAST_PART = 0.05  # fraction of the metals' pixels from which on what they mirror of the object tells
 AVERAGED = 64  # neighbours
-PAINT = (
-    0.35  # the most that the brightest channel of all paint has in the mean; the median of 34 rendered scenes is 0.34
-)
-TOLD_SIDE = 16  # texels along a side of the coarse cubemap in which mirrored directions are counted
-LEAST_MIRRORED = 2.0  # pixels that must mirror one of its texels, so that they tell its radiance
+PAINT = 0.35  # the most that all paint's brightest channel has in the mean; the median of 34 rendered scenes is 0.34
+LEAST_MIRRORED = 2.0  # pixels that must mirror a texel of the coarse cubemap, so that they tell its radiance
 STEP, MOST_STEP = 0.1, 0.05  # part of the way to balance, each time, and the largest step: logarithms
 
 
@@ -100,12 +100,12 @@ def told(found: Reckoned, metals: Tensor) -> Tensor:
 
 
 def told_light(found: Reckoned, metals: Tensor) -> Tensor:
-    """Tell which texels (6·TOLD_SIDE²,) of the light photos show in `metals` (N,)."""
-    seen, pixels = found.seen, torch.zeros(6 * TOLD_SIDE**2)
+    """Tell which texels (6·SIDE²,) of the light photos show in `metals` (N,)."""
+    seen, pixels = found.seen, torch.zeros(6 * SIDE**2)
     for view in range(seen.weight.shape[1]):
         shows = metals & (seen.weight[:, view] > 0) & ~found.met[:, view]
         directions = mirror(-seen.towards[shows, view], seen.normal[shows, view])
-        pixels.index_add_(0, cubemap.texels_at(directions, TOLD_SIDE), seen.weight[shows, view])
+        pixels.index_add_(0, cubemap.texels_at(directions, SIDE), seen.weight[shows, view])
     return pixels > LEAST_MIRRORED
 
 
@@ -151,13 +151,13 @@ def _balance(state: State, logs: Tensor, paint: Tensor) -> Tensor:
     part of lamps is, the less changes.
     """
     radiance = state.method.light.radiance(state.learned["environment"])
-    environment = Environment(radiance)
-    power = radiance * cubemap.texel_solid_angles(environment.resolution).to(radiance).view(-1, 1)
+    area = cubemap.texel_solid_angles(math.isqrt(len(radiance) // 6))
+    power = radiance * area.to(radiance).view(-1, 1)
     whole, lamps = power.sum(dim=0), radiance > CLIPPED
     part = (power * lamps).sum(dim=0) / whole
     surfels = state.surfels()
-    area = paint * surfels.opacities * surfels.scales.prod(dim=1)
-    mean = (logs.amax(dim=1).exp() * area).sum() / area.sum().clamp_min(1e-30)
+    weight = paint * surfels.opacities * surfels.scales.prod(dim=1)
+    mean = (logs.amax(dim=1).exp() * weight).sum() / weight.sum().clamp_min(1e-30)
     wanted = (PAINT / mean.clamp_min(DARKEST)).log().clamp_max(0) + whole.log() - whole.log().mean()
     step = part * (STEP * wanted).clamp(-MOST_STEP, MOST_STEP)
     brighter = 1 + ((-step).exp() - 1) / part.clamp_min(1e-6)

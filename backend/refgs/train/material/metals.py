@@ -28,19 +28,18 @@ TOLD = 0.005  # a change of a larger fraction of the surface is announced
 
 
 class Metals(Part):
-    """Remember whether metals have already been `found`, and whether they are `colored`: photos tell base colours of some that are sure.
+    """Remember whether metals have already been `found`.
 
-    Without masks, they never are. Of each surfel, remember whether hints hold its kind (`held`), whether photos are sure of it (`told`),
-    and the base colour that photos tell of it, if it is metal (`shown_color`, see `base_colors.told`). Checkpoints also keep
-    `state.told_light`.
+    Of each surfel, remember whether hints hold its kind (`held`), whether photos are sure of it (`told`), and the base colour that photos
+    tell of it, if it is metal (`shown_color`, see `base_colors.told`). Checkpoints also keep `state.told_light`. It is None unless photos
+    tell base colours of some metals that are sure; without masks, they never do.
     """
 
-    name, saved = "metals", ("found", "colored")
-    found = colored = False
+    name, saved = "metals", ("found",)
+    found = False
 
     def start(self, state: State) -> None:
-        self.found = self.colored = False
-        state.told_light = None
+        self.found, state.told_light = False, None
         if "metallic" in state.learned:
             state.learned.learn("shown_color", torch.zeros(state.learned.count, 4, device=state.device))
             for name in ("held", "told"):
@@ -91,10 +90,10 @@ def _judge(state: State, first: bool = False) -> None:
     metallic[metal], metallic[paint] = raw_metallic(HELD.metal), raw_metallic(HELD.paint)
     state.learned["told"].copy_(metal | paint)
     shown = state.learned["shown_color"]
-    shown.copy_(base_colors.told(found, _sure_kinds(state)[0].cpu()))
-    state.part(Metals).colored = state.from_hull and bool(shown.any())
-    light = base_colors.told_light(found, _sure_kinds(state)[0].cpu()).to(state.device)
-    state.told_light = light if state.part(Metals).colored else None
+    sure = _sure_kinds(state)[0].cpu()
+    shown.copy_(base_colors.told(found, sure))
+    colored = state.from_hull and bool(shown.any())
+    state.told_light = base_colors.told_light(found, sure).to(state.device) if colored else None
     if raised.any():
         material = torch.logit(base_colors.plausible(like_metals(found))).to(metallic.device)
         albedo[raised], roughness[raised] = material[raised, :3], material[raised, 3]
@@ -185,7 +184,7 @@ def average_paint(state: State, step: Step) -> None:
 
 def _base_colors_kept(state: State) -> bool:
     """Tell whether photos tell base colours of metals, so that they tell the light."""
-    return state.part(Metals).colored and {"albedo", "metallic"} <= state.learned.keys()
+    return state.told_light is not None and {"albedo", "metallic"} <= state.learned.keys()
 
 
 def _sure_kinds(state: State) -> tuple[torch.Tensor, torch.Tensor]:
