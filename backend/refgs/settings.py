@@ -211,6 +211,9 @@ class LossSettings(_Section):
         ge=0,
         description="agreement with the capture's normals and depth from other programs, if it has any (docs/photos.md); fades to 0",
     )
+    outlines: float = Field(
+        ge=0, description="agreement of normals with outlines of the masks, where these show the surface"
+    )
     exposure: float = Field(ge=0, description="penalty of a photo's exposure or white balance that differs from most")
 
 

@@ -80,7 +80,7 @@ def test_carving_matches_float64(isa, monkeypatch):
 
 
 def test_points_lie_evenly_on_the_hull_of_a_sphere():
-    positions, normals, spacing = visual_hull_points(DISCS, VIEWS, (0.1, 0, -0.1), 1.5, 2000, resolution=48)
+    positions, normals, spacing, _ = visual_hull_points(DISCS, VIEWS, (0.1, 0, -0.1), 1.5, 2000, resolution=48)
     assert positions.shape == normals.shape == (2000, 3) and spacing.shape == (2000,)
     assert positions.dtype == normals.dtype == spacing.dtype == np.float32
     distance = sphere(positions)
@@ -95,7 +95,7 @@ def test_points_lie_evenly_on_the_hull_of_a_sphere():
 
 def test_some_points_lie_inside():
     """Check points placed inside the hull: they fill it evenly, and take the normal of the nearest point on its surface."""
-    positions, normals, _ = visual_hull_points(DISCS, VIEWS, (0.1, 0, -0.1), 1.5, 4000, resolution=48, on_hull=1000)
+    positions, normals, *_ = visual_hull_points(DISCS, VIEWS, (0.1, 0, -0.1), 1.5, 4000, resolution=48, on_hull=1000)
     assert positions.shape == normals.shape == (4000, 3)
     assert np.abs(sphere(positions[:1000])).max() < VOXEL
     radius = np.linalg.norm(positions[1000:], axis=1)  # the hull is a ball of radius 1 about the origin
@@ -105,10 +105,19 @@ def test_some_points_lie_inside():
 
 
 def test_a_hole_through_the_object_stays_open():
-    positions, normals, _ = hull([mask(view, torus) for view in VIEWS], count=2000, resolution=64)
+    positions, normals, *_ = hull([mask(view, torus) for view in VIEWS], count=2000, resolution=64)
     assert np.abs(torus(positions)).max() < 0.1
     assert np.hypot(positions[:, 0], positions[:, 1]).min() > 0.4
     assert degrees(normals, gradient(torus, positions)).mean() < 5
+
+
+def test_the_mesh_of_the_hull_faces_outward():
+    surface = hull(DISCS).surface
+    corners = surface.vertices[surface.faces]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert np.abs(sphere(surface.vertices)).max() < VOXEL
+    assert ((facing * corners.mean(axis=1)).sum(axis=1) > 0).all()
+    assert degrees(surface.normals, gradient(sphere, surface.vertices)).mean() < 2.5
 
 
 def test_integer_masks_and_other_image_sizes():
@@ -122,7 +131,7 @@ def test_one_bad_mask_does_not_destroy_the_object(damage, caplog):
     alphas = [*DISCS]
     alphas[7] = damage(alphas[7])
     with caplog.at_level(logging.WARNING):
-        positions, _, _ = hull(alphas)
+        positions, *_ = hull(alphas)
     assert np.abs(sphere(positions)).max() < VOXEL and "left out" in caplog.text
 
 

@@ -55,6 +55,17 @@ def half_ball(p: np.ndarray) -> np.ndarray:
     return np.maximum(np.linalg.norm(p, axis=-1) - 1, p[..., 2])
 
 
+BALL = np.array([0.3, 0.0, 0.4]), 0.25
+"""Centre and radius of the ball of `on_a_disc`."""
+
+
+def on_a_disc(p: np.ndarray) -> np.ndarray:
+    """Return the signed distance of points from a ball that lies on a round disc."""
+    q = np.stack([np.hypot(p[..., 0], p[..., 1]) - 0.9, np.abs(p[..., 2]) - 0.15], axis=-1)
+    disc = np.minimum(q.max(axis=-1), 0) + np.linalg.norm(np.maximum(q, 0), axis=-1)
+    return np.minimum(disc, np.linalg.norm(p - BALL[0], axis=-1) - BALL[1])
+
+
 def carve_coarsely(monkeypatch) -> None:
     """Make `carve_hollows` use few voxels, rays and iterations, for speed."""
     monkeypatch.setattr(field, "SIDE", 64)

@@ -29,6 +29,7 @@ ALL = LossSettings(
     matte=0.7,
     light=0.0,
     prior=0.0,
+    outlines=0.0,
     exposure=0.0,
 )
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])

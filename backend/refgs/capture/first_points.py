@@ -10,8 +10,9 @@ from refgs.capture.box import Box
 from refgs.capture.images import LoadedView
 from refgs.capture.types import Capture
 from refgs.errors import InputError
+from refgs.formats.mesh import SmoothMesh
 from refgs.geometry.hollows import carve_hollows
-from refgs.geometry.hull import Carve, visual_hull_points
+from refgs.geometry.hull import Carve, HullPoints, visual_hull_points
 from refgs.geometry.shape import Photo
 from refgs.settings import SurfelSettings
 
@@ -22,8 +23,8 @@ class FirstPoints(NamedTuple):
     """Hold the points at which surfels start, in the run's frame (the world coordinates of training).
 
     `positions` (N, 3); unit `normals` (N, 3); `spacing` (N,), the mean distance to the three nearest points; sRGB `colours` (N, 3) in 0..1,
-    or None if unknown. The first `on_hull` points lie on the visual hull; `on_hull` is None if there is no hull. `source` says in words
-    where the points come from.
+    or None if unknown. The first `on_hull` points lie on the visual hull, whose mesh is `hull`; both are None if there is no hull. `source`
+    says in words where the points come from.
     """
 
     positions: np.ndarray
@@ -31,6 +32,7 @@ class FirstPoints(NamedTuple):
     spacing: np.ndarray
     colours: np.ndarray | None
     on_hull: int | None
+    hull: SmoothMesh | None
     source: str
 
 
@@ -46,9 +48,9 @@ def first_points(
     """
     count = min(surfels.start, surfels.budget)
     if all(view.alpha is not None for view in views):
-        positions, normals, spacing, on_hull = _hull_points(capture, views, surfels, count, seed, hollows)
+        points, on_hull = _hull_points(capture, views, surfels, count, seed, hollows)
         source = "the visual hull of the masks" + (", less what photos see through" if hollows else "")
-        return FirstPoints(positions, normals, spacing, None, on_hull, source)
+        return FirstPoints(points.positions, points.normals, points.spacing, None, on_hull, points.surface, source)
     colours = None
     if capture.points is not None and _enough(capture.points, capture.box):
         positions, colours = _thinned(capture.points, capture, count, seed)
@@ -56,43 +58,42 @@ def first_points(
     else:
         positions = _random_points(capture, count, seed)
         source = "random points (no masks and no structure-from-motion points)"
-    return FirstPoints(positions, _towards_cameras(positions, views), _spacing(positions), colours, None, source)
+    return FirstPoints(positions, _towards_cameras(positions, views), _spacing(positions), colours, None, None, source)
 
 
 def _hull_points(
     capture: Capture, views: list[LoadedView], surfels: SurfelSettings, count: int, seed: int, hollows: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+) -> tuple[HullPoints, int]:
     """Place `count` points: most on the visual hull of the masks, the others inside it.
 
-    Returns positions (N, 3), unit normals (N, 3), the spacing of the points (N,), and the number of points on the hull. Points on the hull
-    come first.
+    Returns the points, and how many of them are on the hull: these come first.
     """
     cameras = [view.camera for view in views]
     photos = [Photo(view.image, view.alpha, view.camera, view.white) for view in views if view.alpha is not None]
     alphas = [photo.alpha for photo in photos]  # all views have one
     carve = partial(carve_hollows, photos=photos, seed=seed) if hollows else None
 
-    def within(radius: float, carve: Carve | None) -> tuple:
-        shown = max(1, count - round(surfels.inside * count))
+    shown = max(1, count - round(surfels.inside * count))
+
+    def within(radius: float, carve: Carve | None) -> HullPoints:
         grid = {"resolution": surfels.hull, "seed": seed, "on_hull": shown, "carve": carve}
-        found = visual_hull_points(alphas, cameras, capture.centre, radius, count, **grid)
-        return *found, np.arange(count) < shown
+        return visual_hull_points(alphas, cameras, capture.centre, radius, count, **grid)
 
     if capture.box is None:
-        *found, on_it = within(capture.radius, carve)
-        return *found, int(on_it.sum())
+        return within(capture.radius, carve), shown
     around = within(capture.reach, None)  # few points are used: not worth the seconds
     try:
         near = within(capture.radius, carve)
     except InputError:  # masks show an object, but only outside the box
         raise InputError("nothing that the masks show lies in the region: move its box, or enlarge it") from None
-    chosen = _in_and_around(capture.box, near[0], around[0], count, seed)
-    positions, normals, _, on_it = (
-        np.concatenate([values[rows] for values, rows in zip(pair, chosen, strict=True)])
-        for pair in zip(near, around, strict=True)
-    )
+    chosen = _in_and_around(capture.box, near.positions, around.positions, count, seed)
+    on_it = np.concatenate(chosen) < shown
     order = np.argsort(~on_it, kind="stable")
-    return positions[order], normals[order], _spacing(positions[order]), int(on_it.sum())
+    positions, normals = (
+        np.concatenate([values[rows] for values, rows in zip(pair, chosen, strict=True)])[order]
+        for pair in ((near.positions, around.positions), (near.normals, around.normals))
+    )
+    return HullPoints(positions, normals, _spacing(positions), near.surface), int(on_it.sum())
 
 
 def _in_and_around(

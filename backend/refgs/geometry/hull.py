@@ -3,6 +3,7 @@
 import ctypes
 import logging
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -11,6 +12,7 @@ from skimage.measure import marching_cubes
 
 from refgs.camera import Camera
 from refgs.errors import InputError
+from refgs.formats.mesh import SmoothMesh
 from refgs.kernels.layout import Work, struct
 from refgs.kernels.load import kernels, parallel
 
@@ -23,6 +25,23 @@ _HALF = 128  # of 255: a mask shows the object from there
 Carve = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
+class HullPoints(NamedTuple):
+    """Hold points on a visual hull and inside it, in world units.
+
+    - `positions` (N, 3)
+    - `normals` (N, 3): outward unit normals. A point inside has the normal of the nearest point on the hull.
+    - `spacing` (N,): the mean distance to the three nearest other points
+    - `surface`: the hull's mesh
+
+    The arrays are float32.
+    """
+
+    positions: np.ndarray
+    normals: np.ndarray
+    spacing: np.ndarray
+    surface: SmoothMesh
+
+
 def visual_hull_points(
     alphas: Sequence[np.ndarray],
     cameras: Sequence[Camera],
@@ -33,14 +52,10 @@ def visual_hull_points(
     seed: int = 0,
     on_hull: int | None = None,
     carve: Carve | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> HullPoints:
     """Spread `count` points on the visual hull of an object: the largest shape that fits into all masks.
 
-    Returns float32 arrays in world units:
-
-    - positions (count, 3). The first `on_hull` points (None: all) lie evenly on the hull. The others are random points inside.
-    - outward unit normals (count, 3). A point inside has the normal of the nearest point on the hull.
-    - spacing (count,): the mean distance to the three nearest other points
+    The first `on_hull` points (None: all) lie evenly on the hull. The others are random points inside.
 
     `alphas` are the masks (H, W), one for each camera, floats in 0..1 or uint8. The hull is carved twice, on a grid of `resolution`³
     voxels: first in the cube of half-side `radius` about `centre`, then in the bounding box of the result. A view is left out, with a
@@ -100,18 +115,24 @@ def visual_hull_points(
     points = _choose_evenly(_sample_triangles(vertices * voxel, faces, 10 * on_hull, rng), on_hull)
     # Compute normals from a wider filter: masks' edges are about a voxel wide, so the gradient of one voxel is noise.
     wide = gaussian_filter(field, 1.5)
-    normals = np.stack(
-        [-map_coordinates(np.gradient(wide, voxel[a], axis=a), (points / voxel).T, order=1) for a in range(3)], axis=1
-    )
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    slope = [-np.gradient(wide, voxel[a], axis=a) for a in range(3)]
+    normals, outward = (_normals(slope, at) for at in (points / voxel, vertices))
     solid = rng.choice(np.argwhere(field > 0.5), count - on_hull)
     within = (solid + rng.uniform(-0.5, 0.5, solid.shape)) * voxel
     normals = np.concatenate([normals, normals[cKDTree(points).query(within)[1]]])
     points = np.concatenate([points, within])
     neighbours = [2, 3, 4][: count - 1]
     spacing = cKDTree(points).query(points, k=neighbours)[0].mean(1) if neighbours else np.full(1, radius)
-    positions = points + low + voxel * (0.5 - 3)
-    return positions.astype(np.float32), normals.astype(np.float32), spacing.astype(np.float32)
+    first = low + voxel * (0.5 - 3)
+    outside = np.ascontiguousarray(faces[:, ::-1])  # seen from outside, corners go round anticlockwise
+    surface = SmoothMesh(first + voxel * vertices, outside, outward)
+    return HullPoints(*(x.astype(np.float32) for x in (first + points, normals, spacing)), surface)
+
+
+def _normals(slope: list[np.ndarray], at: np.ndarray) -> np.ndarray:
+    """Interpolate the slope, three grids, at positions (N, 3) in voxels, and return unit vectors (N, 3)."""
+    normals = np.stack([map_coordinates(part, at.T, order=1) for part in slope], axis=1)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
 
 
 def _as_bytes(alpha: np.ndarray) -> np.ndarray:

@@ -38,7 +38,11 @@ class Shape:
 
     def fit(self, camera: Camera, across: int) -> Camera:
         """Reduce the camera, never enlarging it, until the shape's ball is `across` pixels wide."""
-        centre, radius = self.ball
-        distance = float(np.linalg.norm(camera.position - centre))
-        side = across * max(camera.width, camera.height) * distance / (2 * radius * camera.fx)
-        return camera.fitted(max(round(side), 1))
+        return fitted(camera, *self.ball, across)
+
+
+def fitted(camera: Camera, centre: np.ndarray, radius: float, across: int) -> Camera:
+    """Reduce the camera, never enlarging it, until a ball is `across` pixels wide."""
+    distance = float(np.linalg.norm(camera.position - centre))
+    side = across * max(camera.width, camera.height) * distance / (2 * radius * camera.fx)
+    return camera.fitted(max(round(side), 1))

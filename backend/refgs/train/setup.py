@@ -16,11 +16,12 @@ from refgs.model.surfels import Parameters, activate
 from refgs.train.decide import needs
 from refgs.train.decide.object_size import limit_surfels, object_size
 from refgs.train.keep.progress import Means
-from refgs.train.learn import coarse, light, priors
+from refgs.train.learn import coarse, light, outlines, priors
 from refgs.train.learn.coarse import Coarse
 from refgs.train.learn.densify import Densification
 from refgs.train.learn.exposures import EXPOSURE, Exposures
 from refgs.train.learn.light import MirroredLight
+from refgs.train.learn.outlines import Outlines
 from refgs.train.learn.poses import Poses
 from refgs.train.learn.priors import Priors
 from refgs.train.learn.trace import TracedMesh
@@ -34,7 +35,7 @@ from refgs.train.state import State, why_not_traced
 from refgs.train.timeline import Step
 
 PARTS: tuple[type[Part], ...] = (
-    Metals, Densification, Poses, Exposures, MirroredLight, TracedMesh, Coarse, Priors, Means,
+    Metals, Densification, Poses, Exposures, MirroredLight, TracedMesh, Coarse, Outlines, Priors, Means,
 )  # fmt: skip
 """The parts of a training that remember something, in the order in which a checkpoint restores them."""
 
@@ -62,6 +63,7 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     size = object_size(state)
     limit_surfels(state, size.area)
     coarse.begin(state, size.span, refined=state.part(Poses).values is not None)
+    outlines.load(state, start.points.hull)
     priors.load(state)
     return state
 

@@ -44,7 +44,7 @@ def start_parameters(capture: Capture, views: list[LoadedView], settings: Settin
 
 def start_appearance(settings: Settings) -> Parameters:
     """Make the initial colour and material parameters, each with one row for all surfels."""
-    one = FirstPoints(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.ones(1), None, None, "")
+    one = FirstPoints(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.ones(1), None, None, None, "")
     made = _initial(one, settings.surfels, 0.5)
     return {name: value.detach() for name, value in made.items() if name not in GEOMETRY}
 
