@@ -2,17 +2,51 @@
 
 While a .blend is open, these paths are absolute. They are made relative before it is saved, and absolute again afterwards. Blender itself
 makes the paths of images relative, but not paths in other properties.
+
+A .blend that was copied alone may still lead into the runs of the original. `check_own` refuses to write there.
 """
 
+import json
 import os
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import bpy
 
+from .errors import InputError
 from .nodes.panorama_world import get_light, is_panorama
 from .scene.camera_objects import MASK, PHOTO, STROKES
 from .scene.capture_cameras import CAPTURE
 from .scene.run_parts import FOLDER
+
+SAVED = "refgs_saved"  # custom property of a scene: the file that it was saved in
+BORROWED = "refgs_borrowed"  # custom property of a scene, JSON: folders of another .blend, of which this one is a copy, and that .blend
+
+
+def check_own(scene: bpy.types.Scene, folder: Path) -> None:
+    """Raise InputError if a folder with results belongs to another .blend, of which the open one is a copy."""
+    owner = json.loads(scene.get(BORROWED, "{}")).get(str(folder))
+    if owner and os.path.isfile(owner) and not _same(owner, bpy.data.filepath):
+        raise InputError(
+            f"{folder} belongs to {owner}, of which this file is a copy: continue there, or choose a copy of the folder"
+        )
+
+
+def _borrow(scene: bpy.types.Scene) -> None:
+    """Note which folders of a scene, as it was saved, are those of the file that it was saved in, if the open file is a copy of that."""
+    saved, now = scene.get(SAVED, ""), bpy.data.filepath
+    if not now or not os.path.isfile(saved) or _same(saved, now):
+        return
+    settings = scene.refgs
+    paths = [settings.many.captures, settings.many.results, *(known.folder for known in settings.runs)]
+    here, there = ([_absolute(path, os.path.dirname(file)) for path in paths] for file in (now, saved))
+    shared = [mine for mine, theirs in zip(here, there, strict=True) if _same(mine, theirs)]
+    scene[BORROWED] = json.dumps(dict.fromkeys(shared, saved) | json.loads(scene.get(BORROWED, "{}")))
+
+
+def _same(one: str, other: str) -> bool:
+    """Check whether two paths lead to the same file or folder, and it exists."""
+    return os.path.exists(one) and os.path.exists(other) and os.path.samefile(one, other)
 
 
 def change_paths(change: Callable[[str], str]) -> None:
@@ -72,15 +106,26 @@ def _before_saving(file: str, *_) -> None:
                 image.filepath_raw = _relative(image.filepath, before)
     if after:  # else it is the startup file
         change_paths(lambda path: _relative(_absolute(path, before), after))
+        _remember_file(file)
 
 
 @bpy.app.handlers.persistent
 def _after_saving(file: str, *_) -> None:
     change_paths(lambda path: _absolute(path, os.path.dirname(file)))
+    _remember_file(bpy.data.filepath)  # another than `file`, if a copy was saved
+
+
+def _remember_file(file: str) -> None:
+    for scene in bpy.data.scenes:
+        if scene.library is None:
+            scene[SAVED] = file
 
 
 @bpy.app.handlers.persistent
 def _after_loading(*_) -> None:
+    for scene in bpy.data.scenes:
+        if scene.library is None:
+            _borrow(scene)
     change_paths(lambda path: _absolute(path, os.path.dirname(bpy.data.filepath)))
 
 

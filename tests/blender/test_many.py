@@ -55,6 +55,19 @@ def test_rows_say_how_far_runs_are(results):
     }
 
 
+@pytest.mark.parametrize("typed", [True, False])
+def test_a_copied_file_does_not_continue_the_originals_batch(addon, results, tmp_path, typed):
+    if not typed:
+        addon.refgs.many.results = ""
+        (tmp_path / "shelf RefGS").mkdir()
+    (tmp_path / "a").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a" / "a.blend"))
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "b" / "a.blend"))
+    with pytest.raises(InputError, match="of which this file is a copy"):
+        many.train_many(bpy.context.scene)
+
+
 def test_what_a_killed_batch_left_is_stopped(results):
     assert [row.state for row in batch_table.read_rows(results)] == ["done", "failed", "stopped", "stopped"]
 

@@ -14,10 +14,12 @@ from filelock import FileLock
 from scipy.spatial.transform import Rotation
 
 from refgs_addon import jobs
+from refgs_addon.blend_paths import check_own
 from refgs_addon.errors import InputError
 from refgs_addon.ply_file import read_rows
 from refgs_addon.scene.camera_objects import photo_shown
 from refgs_addon.scene.capture_cameras import cameras_of
+from refgs_addon.scene.find_run import find_run
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.trainer import commands, preferences, timers
 from refgs_addon.trainer.scene import training, training_box
@@ -77,6 +79,50 @@ def test_the_buttons_train_and_the_file_remembers(addon, capture, tmp_path):
         training.resume(scene, out)
     training.forget(scene, out)
     assert not scene.refgs.runs and out.is_dir()
+
+
+def stopped(scene):
+    """Train with the fake trainer, and stop the training. Returns the run folder."""
+    scene.refgs.mesh = False
+    job = training.train(scene)
+    until(lambda: job.progress)
+    bpy.ops.refgs.tell(serial=job.serial, command="cancel")
+    assert final_state(job) == "cancelled"
+    return job.run
+
+
+def test_a_copied_file_does_not_resume_the_originals_run(addon, capture, tmp_path):
+    """Check a .blend that was copied without the run, to where its relative path leads to the same run."""
+    first, second = (tmp_path / name / "a.blend" for name in ("first", "second"))
+    first.parent.mkdir()
+    run = stopped(addon)
+    bpy.ops.wm.save_as_mainfile(filepath=str(first))
+    shutil.copytree(first.parent, second.parent)
+    for _ in range(2):  # the second time as it was saved
+        bpy.ops.wm.open_mainfile(filepath=str(second))
+        with pytest.raises(InputError, match=rf"belongs to {first}, of which this file is a copy: continue there"):
+            training.resume(bpy.context.scene, run)
+        bpy.ops.wm.save_mainfile()
+    mine = shutil.copytree(run, tmp_path / "second" / "run")
+    find_run(run, mine)
+    training.resume(bpy.context.scene, mine)
+    assert final_state(jobs.JOBS[-1]) == "done" and jobs.run_state(run) == "stopped"
+    bpy.ops.wm.open_mainfile(filepath=str(first))
+    training.resume(bpy.context.scene, run)
+    assert final_state(jobs.JOBS[-1]) == "done"
+
+
+def test_a_file_saved_elsewhere_still_resumes_its_run(addon, capture, tmp_path):
+    run = stopped(addon)
+    (tmp_path / "else").mkdir()
+    for file in (tmp_path / "a.blend", tmp_path / "else" / "b.blend"):
+        bpy.ops.wm.save_as_mainfile(filepath=str(file))
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "c.blend"), copy=True)
+    for file in (tmp_path / "c.blend", tmp_path / "else" / "b.blend"):
+        bpy.ops.wm.open_mainfile(filepath=str(file))
+        check_own(bpy.context.scene, run)
+    training.resume(bpy.context.scene, run)
+    assert final_state(jobs.JOBS[-1]) == "done"
 
 
 class Buttons:

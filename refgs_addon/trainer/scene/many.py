@@ -5,6 +5,7 @@ from pathlib import Path
 import bpy
 
 from ... import jobs
+from ...blend_paths import check_own
 from ...errors import InputError
 from ...job_timers import follow_jobs
 from ...preferences import log_file
@@ -28,11 +29,13 @@ def train_many(scene: bpy.types.Scene) -> jobs.Job:
     """Start a batch: a job that trains on all captures of the scene's folder. `batch_table` shows its progress.
 
     Steps that an earlier batch completed in the folder for the runs are not repeated. Raises InputError if there is no trainer or no folder
-    of captures, or if a batch is already running in the folder for the runs.
+    of captures, if a batch is already running in the folder for the runs, or if that folder belongs to another .blend.
     """
     captures, out = _captures(scene), results_folder(scene)
     if captures is None:
         raise InputError("no captures are chosen: choose the folder that they are in")
+    if out.exists():
+        check_own(scene, out if scene.refgs.many.results else captures)
     trainer = python()
     jobs.JOBS[:] = [job for job in jobs.JOBS if not (job.ended and job.run == out / jobs.LOGS)]
     job = commands.train_many(trainer, captures, out, log_file(f"many {out.name}"), scene.refgs.many.preset)

@@ -8,6 +8,7 @@ import bpy
 from mathutils import Matrix, Vector
 
 from ... import jobs
+from ...blend_paths import check_own
 from ...errors import InputError
 from ...job_timers import follow_jobs
 from ...json_file import read_json
@@ -263,13 +264,14 @@ def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.
 
 
 def resume(scene: bpy.types.Scene, folder: Path) -> jobs.Job:
-    """Resume a run of the scene's list. Raises InputError where it is not stopped."""
+    """Resume a run of the scene's list. Raises InputError where it is not stopped, or belongs to another .blend."""
     known = next((known for known in scene.refgs.runs if Path(known.folder) == folder), None)
     state = jobs.run_state(folder)
     if state == "training":
         raise InputError(f"{folder} is being trained already by another process: stop that or wait for it")
     if known is None or state != "stopped":
         raise InputError(f"{folder} has no stopped training to resume: start a new one")
+    check_own(scene, folder)
     asked = commands.Asked(Path(known.capture), folder, resume=True)
     job = commands.train(python(), asked, log_file(folder.name), scene.refgs.mesh)
     follow_jobs()
