@@ -6,6 +6,7 @@ from . import add, add_input, math, modifier_tree, out, store_attribute
 
 NAME = "RefGS Kept"  # the tree and its modifier
 ROW = "row"  # attribute of the splats that are left: where each was among all splats
+OPENED = "opened"  # attribute of the splats that are left: 1 if others were deleted, and the inside can be seen
 _SAME = 1e-6  # farthest that a splat is from its own point, which is a copy of its position
 
 
@@ -27,6 +28,11 @@ def kept_tree() -> bpy.types.NodeTree:
     index = out(add(tree, "GeometryNodeInputIndex"))
     stored = store_attribute(tree, group["Geometry"], ROW, "INT", index)
     gone = math(tree, "GREATER_THAN", distance, _SAME)
-    kept = add(tree, "GeometryNodeDeleteGeometry", {"Geometry": stored, "Selection": gone})
-    add(tree, "NodeGroupOutput", {"Geometry": out(kept)})
+    kept = out(add(tree, "GeometryNodeDeleteGeometry", {"Geometry": stored, "Selection": gone}))
+    before, after = (
+        add(tree, "GeometryNodeAttributeDomainSize", {"Geometry": cloud}, component="POINTCLOUD").outputs["Point Count"]
+        for cloud in (group["Geometry"], kept)
+    )
+    opened = store_attribute(tree, kept, OPENED, "FLOAT", math(tree, "GREATER_THAN", before, after))
+    add(tree, "NodeGroupOutput", {"Geometry": opened})
     return tree

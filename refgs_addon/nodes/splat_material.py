@@ -5,6 +5,7 @@ import bpy
 from ..compat import node_tree
 from . import add, math, out, principled, scaled, vector_math
 from .edit_tree import AMOUNT
+from .kept_tree import OPENED
 from .splats_tree import EXTENT, draws_splats
 from .world_diffuse import surface_inputs
 
@@ -20,12 +21,13 @@ def splat_material(name: str, constants: dict[str, float], two_sided: bool = Fal
     `constants` maps "metallic", "roughness" or "specular" to one value for all splats. The material then uses this value, and not the
     splats' own.
 
-    The back of a splat is black, like the inside of a solid. A lit back would shine through the small gaps between the front splats. With
-    `two_sided`, each normal is turned to the viewer instead, for splats whose normals point to either side.
+    The back of a splat is black, like the inside of a solid. A lit back would shine through the small gaps between the front splats. Once
+    splats are deleted, one looks into the object, and black would be a crust on the cut: backs are matte, as no photo shows their gloss.
+    With `two_sided`, each normal is turned to the viewer instead, for splats whose normals point to either side.
     """
     material = bpy.data.materials.new(name)
     tree = node_tree(material)
-    normal, front = _normal(tree, two_sided)
+    normal, front = _normal(tree)
     surface = add(
         tree,
         "ShaderNodeBsdfPrincipled",
@@ -40,7 +42,10 @@ def splat_material(name: str, constants: dict[str, float], two_sided: bool = Fal
             tree.links.new(_attribute(tree, key, FACTOR), surface.inputs[_SURFACE[key]])
     if not two_sided:
         black = add(tree, "ShaderNodeEmission", {"Strength": 0.0})
-        surface = add(tree, "ShaderNodeMixShader", {0: front, 1: out(black), 2: out(surface)})
+        matte = add(tree, "ShaderNodeBsdfDiffuse", {"Color": _attribute(tree, "base_color", COLOR), "Normal": normal})
+        opened = _attribute(tree, OPENED, FACTOR)
+        back = add(tree, "ShaderNodeMixShader", {0: opened, 1: out(black), 2: out(matte)})
+        surface = add(tree, "ShaderNodeMixShader", {0: front, 1: out(back), 2: out(surface)})
     _finish(material, out(surface))
     return material
 
@@ -97,8 +102,8 @@ def _attribute(tree: bpy.types.NodeTree, name: str, output: int) -> bpy.types.No
     return add(tree, "ShaderNodeAttribute", attribute_name=name).outputs[output]
 
 
-def _normal(tree: bpy.types.NodeTree, two_sided: bool) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
-    """Add nodes for a curved splat's world-space normal, with `two_sided` turned to the viewer, and visible side (1 front, 0 back)."""
+def _normal(tree: bpy.types.NodeTree) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
+    """Add nodes for a curved splat's world-space normal, turned to the viewer, and its visible side (1 front, 0 back)."""
     u, v = _place(tree)
     centre = _attribute(tree, "normal", VECTOR)
     bent = vector_math(tree, "ADD", centre, scaled(tree, _attribute(tree, "normal_u", VECTOR), u))
@@ -111,9 +116,7 @@ def _normal(tree: bpy.types.NodeTree, two_sided: bool) -> tuple[bpy.types.NodeSo
     viewer = add(tree, "ShaderNodeNewGeometry").outputs["Incoming"]
     facing = vector_math(tree, "DOT_PRODUCT", to_world(centre), viewer)
     front = math(tree, "GREATER_THAN", facing, 0.0)
-    bent = vector_math(tree, "NORMALIZE", to_world(bent))
-    if two_sided:
-        bent = scaled(tree, bent, math(tree, "SIGN", facing))
+    bent = scaled(tree, vector_math(tree, "NORMALIZE", to_world(bent)), math(tree, "SIGN", facing))
     # Near silhouettes the normal can point away from the viewer, and a BSDF would be black: it is turned until it is perpendicular.
     away = math(tree, "MINIMUM", vector_math(tree, "DOT_PRODUCT", bent, viewer), 0.0)
     return vector_math(tree, "NORMALIZE", vector_math(tree, "SUBTRACT", bent, scaled(tree, viewer, away))), front

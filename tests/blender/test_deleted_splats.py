@@ -5,14 +5,16 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
+from refgs.formats.splats import write_splats
 from refgs_addon.nodes.kept_tree import NAME
 from refgs_addon.scene.deleted_splats import add_points, count_deleted, points_of, restore
 from refgs_addon.scene.edit import add_edit, is_edited
 from refgs_addon.scene.export_run import export_mesh, export_run, export_splats
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.run_parts import show
-from tests.makers.blender import attribute, drawn
+from tests.makers.blender import attribute, brightness_from_above, drawn
 from tests.makers.runs import COUNT
+from tests.makers.splats import make
 
 GONE = [3, 17, 39]
 
@@ -74,6 +76,24 @@ def test_what_was_deleted_is_not_exported(run, run_folder, tmp_path):
     again = import_run(tmp_path / "new", bpy.context.scene)
     assert len(again.splats.data.points) == COUNT - len(GONE)
     np.testing.assert_allclose(attribute(again.splats.data, "metallic"), np.delete(before["metallic"], GONE), atol=1e-6)
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_a_cut_shows_no_black_backs(scene, tmp_path, cut):
+    """Check that backs, which are black, are lit once a splat is deleted: one looks into the object."""
+    splats = make(2, 1)
+    splats.positions[:] = [[0, 0, 0], [0, 0, 0.1]]
+    splats.normals[:], splats.rotations[:] = (0, 0, -1), (0, 1, 0, 0)
+    splats.scales[:], splats.opacities[:], splats.albedo[:], splats.sh[:] = 2.0, 0.999, 0.8, 0.8
+    splats.roughness[:], splats.metallic[:] = 1, 1
+    write_splats(tmp_path / "a.ply", splats)
+    run = import_run(tmp_path / "a.ply", scene)
+    points = add_points(run.splats)
+    if cut:
+        delete(points, [1])
+        bpy.ops.object.mode_set(mode="OBJECT")
+    seen = brightness_from_above(run, scene, tmp_path)
+    assert seen > 0.3 if cut else seen < 0.1
 
 
 def test_buttons_delete_and_restore(run_folder, addon):

@@ -3,7 +3,6 @@
 import bpy
 import numpy as np
 import pytest
-from mathutils import Vector
 
 from refgs.formats.splats import read_splats, write_display_splats, write_splats
 from refgs.formats.spz import write_spz
@@ -11,7 +10,7 @@ from refgs_addon.errors import InputError
 from refgs_addon.scene.export_run import export_splats
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.run_parts import FOLDER, THEIRS
-from tests.makers.blender import attribute
+from tests.makers.blender import attribute, brightness_from_above
 from tests.makers.splats import make
 
 WRITERS = {".ply": write_display_splats, ".spz": write_spz, ".SPZ": write_spz}
@@ -52,27 +51,6 @@ def test_runs_are_not_said_to_be_others(run):
     assert THEIRS not in run.collection and run.collection[FOLDER]
 
 
-def brightness(scene, tmp_path, file):
-    """Import one large splat and render it from above, under a white light. Returns the green of its middle, linear."""
-    run = import_run(file, scene)
-    run.root.location = (0, 0, 0)
-    scene.world = bpy.data.worlds.new("white")
-    scene.world.use_nodes = True
-    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (1, 1, 1, 1)
-    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
-    scene.collection.objects.link(camera)
-    bpy.context.view_layer.update()
-    middle = sum((run.splats.matrix_world @ Vector(corner) for corner in run.splats.bound_box), Vector()) / 8
-    camera.location, scene.camera = middle + Vector((0, 0, 3)), camera
-    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 16, False
-    scene.render.resolution_x = scene.render.resolution_y = 8
-    scene.render.image_settings.file_format = "OPEN_EXR"
-    scene.render.filepath = str(tmp_path / "a.exr")
-    bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(scene.render.filepath)
-    return np.array(image.pixels[:]).reshape(8, 8, 4)[3:5, 3:5, 1].mean()
-
-
 @pytest.mark.parametrize("ours", [False, True])
 def test_normals_that_point_away_are_turned_to_the_viewer(tmp_path, scene, ours):
     splats = make(1, 1)
@@ -82,5 +60,5 @@ def test_normals_that_point_away_are_turned_to_the_viewer(tmp_path, scene, ours)
     splats.roughness[:], splats.metallic[:] = 1, 0
     (write_splats if ours else write_display_splats)(tmp_path / "a.ply", splats)
     assert (read_splats(tmp_path / "a.ply").normals[0] == (0, 0, -1)).all()
-    seen = brightness(scene, tmp_path, tmp_path / "a.ply")
+    seen = brightness_from_above(import_run(tmp_path / "a.ply", scene), scene, tmp_path)
     assert seen < 0.1 if ours else seen > 0.3  # RefGS's own splats have a black back

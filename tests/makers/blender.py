@@ -2,6 +2,7 @@
 
 import bpy
 import numpy as np
+from mathutils import Vector
 
 from refgs_addon.compat import DRAWS_SPLATS
 from refgs_addon.nodes.splats_tree import EXTENT
@@ -56,3 +57,23 @@ def drawn_axes(item):
 def principled(material):
     """Return the Principled BSDF node of a material."""
     return next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+
+
+def brightness_from_above(run, scene, folder):
+    """Render an imported run from above, under a white light. Returns the green of its middle, linear."""
+    run.root.location = (0, 0, 0)
+    scene.world = bpy.data.worlds.new("white")
+    scene.world.use_nodes = True
+    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (1, 1, 1, 1)
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(camera)
+    bpy.context.view_layer.update()
+    middle = sum((run.splats.matrix_world @ Vector(corner) for corner in run.splats.bound_box), Vector()) / 8
+    camera.location, scene.camera = middle + Vector((0, 0, 3)), camera
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 16, False
+    scene.render.resolution_x = scene.render.resolution_y = 8
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.filepath = str(folder / "a.exr")
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(scene.render.filepath)
+    return np.array(image.pixels[:]).reshape(8, 8, 4)[3:5, 3:5, 1].mean()
