@@ -16,10 +16,10 @@ FAINT = 100  # splats in the ball that are nearly transparent
 PHOTOS = {"left": (255, 0, 255), "right": (0, 255, 0)}  # colours (BGR) of photos that show nothing else
 
 
-def write_still_life(folder):
+def write_still_life(folder, doubt=None):
     """Write a run folder with a ball that stands on a floor, and a few faint splats in the ball. It says which photos it is of.
 
-    Returns the folder.
+    `doubt` is that of all splats, None for a run without. Returns the folder.
     """
     ball = spread(BALL)
     x, y = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(-2, 2, SIDE)]))
@@ -33,6 +33,8 @@ def write_still_life(folder):
     columns |= {f"rot_{i}": value for i, value in enumerate(np.array(turns).T)}
     columns["scale_0"] = columns["scale_1"] = np.full(len(places), np.log(0.06))
     columns["opacity"] = np.where(np.arange(len(places)) < len(places) - FAINT, 2.0, -3.0)
+    if doubt is not None:
+        columns["doubt"] = np.full(len(places), doubt)
     folder.mkdir()
     write_ply(folder / "splats.ply", columns)
     (folder / "checkpoints").mkdir()

@@ -1,89 +1,86 @@
-"""Click as an artist does who sees a run for the first time, and report what the clicks did.
+"""Click through the first ten minutes as an artist does, from an empty file to a relit picture, and report what the clicks did.
 
 Arguments: the Python with the trainer, and the run folder. stage.py shows the command line.
 """
 
+import shutil
+
 import bpy
-from stage import (
-    WORDS,
-    act,
-    addon,
-    after,
-    area,
-    choose_tab,
-    click,
-    hover,
-    install,
-    jobs,
-    panels,
-    photograph,
-    press,
-    region,
-    report,
-    set_python,
-    view,
-)
+from hands import choose_file, choose_tab, click, point, press, push
+from stage import OUT, WORDS, act, addon, after, area, install, jobs, photograph, region, report, set_python
 
 PYTHON, RUN = WORDS
+WHERE = "Everywhere", "Box", "Sphere", "Similar", "Painted"  # the entries of the menu Edit Material
+# Steps to the right and up, in pixels.
+LIGHT = 0, 70  # from the button below the light's picture to the picture
+SUNRISE, SUNSET = (80, 297), (-802, 150)  # from there to the panoramas in the menu, which opens above it
+EDIT = 0, -26  # from the button above the menu Edit Material to the menu
+MATERIALS = -68, 0  # from the button that removes an edit to its materials
+COPPER = 6, 184  # from there to Copper
 
 
 def artist():
-    """Install the extension, import a run, and click. Each `yield` gives a function; the next step waits until it returns true."""
+    """Install the extensions, empty the file, and click. Each `yield` gives a function; the next step waits until it returns true."""
+    report["xdotool"] = shutil.which("xdotool") is not None
+    if not report["xdotool"]:
+        return
+    bpy.context.preferences.system.use_region_overlap = False  # else each look for a button draws the 3D view again
     install()
-    bpy.ops.object.select_all(action="SELECT")
-    bpy.ops.object.delete()
-    bpy.ops.refgs.import_run(directory=RUN)
-    area().spaces.active.show_region_ui = True
-    yield after(2.0)
-    choose_tab()
+    set_python(PYTHON)
+    bpy.context.scene.refgs.mesh = False
+    yield after(1.0)
+    for key in ("a", "Delete", "n"):
+        yield from press(key, 600, 480)
+    report["left"] = len(bpy.data.objects)
+    yield from choose_tab()
+    yield from push("refgs.import_run")
+    yield from choose_file(RUN)
     report["imported"] = area().spaces.active.shading.type
-    yield after(15.0)  # to compile shaders
+    yield after(10.0)  # to compile shaders
     photograph("imported")
-    yield from choose_light()
+    yield from push("refgs.relight", beside=LIGHT, entry=SUNRISE)
+    yield after(3.0)
+    photograph("lit")
+    report["light"] = light()
+    yield from push("refgs.recovered_light")
     yield from show_photos()
     yield from edit_regions()
     yield from paint()
     yield from hint()
+    yield from make_picture()
 
 
-def choose_light():
-    """Click on the light's picture, then on a picture in the menu that opens below it."""
-    registered = panels()
-    for cls in registered:
-        if cls.__name__ != "LightPanel":  # the only panel's place in the sidebar is known
-            bpy.utils.unregister_class(cls)
-    area().tag_redraw()
-    yield after(3.0)
-    sidebar = region("UI")
-    middle, top = sidebar.x + sidebar.width // 2, sidebar.y + sidebar.height
-    click(middle, top - 90)
-    yield after(3.0)
-    photograph("lights")
-    click(middle - 212, top - 225)
-    yield after(2.0)
-    photograph("lit")
-    report["light"] = bpy.context.scene.world.node_tree.nodes["RefGS HDRI"].image.filepath
-    bpy.ops.refgs.recovered_light()
-    for cls in registered:
-        if cls.__name__ != "LightPanel":
-            bpy.utils.register_class(cls)
+def light():
+    """Return the file of the panorama that lights the scene."""
+    return bpy.context.scene.world.node_tree.nodes["RefGS HDRI"].image.filepath
 
 
 def show_photos():
-    """Lay a photo over its camera's view, and step to the next camera."""
-    with view():
-        bpy.ops.refgs.photo()
-    yield after(3.0)
-    photograph("left")
-    with view():
-        bpy.ops.refgs.next_camera()
-    yield after(3.0)
-    photograph("right")
-    with view():
-        bpy.ops.refgs.photo()
-        bpy.ops.view3d.view_camera()  # back
-    yield after(3.0)
-    photograph("no photo")
+    """Lay a photo over its camera's view, step to the next camera, take the photo away, and leave the camera."""
+    for name, button, part in (
+        ("left", "refgs.photo()", 0.4),
+        ("right", "refgs.next_camera(steps=1)", 0.91),
+        ("no photo", "refgs.photo()", 0.3),
+    ):
+        yield from push(button, part)
+        yield after(3.0)
+        photograph(name)
+    yield from press("KP_0", *middle())
+    report["perspective"] = area().spaces.active.region_3d.view_perspective
+
+
+def middle():
+    """Return the middle of the 3D view, where the ball is."""
+    shown = region("WINDOW")
+    return shown.x + shown.width // 2, shown.y + shown.height // 2
+
+
+def add_edit(where):
+    yield from push("refgs.show_doubt", beside=EDIT, entry=(0, -24 - 23 * WHERE.index(where)))
+
+
+def remove_edit():
+    yield from push("refgs.remove_edit", 0.91)
 
 
 def edit_regions():
@@ -91,78 +88,76 @@ def edit_regions():
     report["edited"] = {}
     for where in ("Box", "Sphere", "Similar"):
         area().spaces.active.shading.type = "SOLID"
-        with view():
-            bpy.ops.refgs.add_edit(where=where)
-        region = bpy.context.view_layer.objects.active
-        report["edited"][where] = area().spaces.active.shading.type, region.name
-        yield after(8.0)
+        yield from add_edit(where)
+        report["edited"][where] = area().spaces.active.shading.type, bpy.context.view_layer.objects.active.name
+        yield after(4.0)
         photograph(where)
-        splats = bpy.data.objects["still splats"]
-        bpy.ops.refgs.remove_edit(splats=splats.name, edit=addon("scene.edit").edits(splats)[0].name)
-        yield after(1.0)
+        yield from remove_edit()
 
 
 def paint():
     """Paint the whole mesh, then show the splats and the mesh."""
-    with view():
-        bpy.ops.refgs.add_edit(where="Painted")
-    canvas = bpy.context.view_layer.objects.active
+    yield from add_edit("Painted")
     report["painting"] = bpy.context.mode
+    canvas = bpy.context.view_layer.objects.active  # painted by a script: Debian's Blender comes without brushes
     canvas.vertex_groups.active.add(range(len(canvas.data.vertices)), 1.0, "REPLACE")
-    for part in ("splats", "mesh"):
-        with view():
-            bpy.ops.refgs.show(collection="RefGS still", part=part)
-        yield after(8.0)
-        photograph(f"painted {part}")
-    bpy.ops.refgs.remove_edit(
-        splats="still splats", edit=addon("scene.edit").edits(bpy.data.objects["still splats"])[0].name
-    )
-    yield after(1.0)
+    for name, part in (("splats", 0.15), ("mesh", 0.5)):
+        yield from push(f"part='{name}'", part)
+        yield after(4.0)
+        photograph(f"painted {name}")
+    yield from remove_edit()
 
 
 def hint():
     """Say that the ball is metal. Cancel before the click, then the dialogue, then train; then answer a question, and cancel."""
-    set_python(PYTHON)
-    bpy.context.scene.refgs.mesh = False
-    bpy.context.view_layer.objects.active = bpy.data.objects["still mesh"]
-    shown = region("WINDOW")
-    ball = shown.x + shown.width // 2, shown.y + shown.height // 2
     report["begun"], highlighted = {}, addon("trainer.ui.highlight")
 
     def count(step):
         begun = sum(job.run is not None for job in jobs())
         report["begun"][step] = begun, len(bpy.context.scene.refgs.runs), highlighted._handler is not None
 
-    yield after(3.0)
     for step in ("hovered", "asked", "agreed"):
-        with view():
-            bpy.ops.refgs.hint("INVOKE_DEFAULT", kind="metal")
-        yield after(1.0)
-        hover(*ball)
+        yield from push("refgs.hint(kind='metal', question=0)")
+        point(*middle())
         yield after(3.0)
         if step == "hovered":
             photograph("hovered")
             count("hovering")
         else:
-            click(*ball)
-            yield after(3.0)
+            yield from click(*middle())
+            yield after(2.0)
         if step == "asked":
             photograph("asked")
             count("asking")
-        press("RET" if step == "agreed" else "ESC", *ball)
-        yield after(2.0)
+        yield from press("Return" if step == "agreed" else "Escape", *middle())
         if step == "asked":
             photograph("cancelled")
         count(step)
     yield lambda: jobs()[-1].ended
     report["hinted"] = jobs()[-1].state, jobs()[-1].name
-    with view():
-        bpy.ops.refgs.hint("INVOKE_DEFAULT", kind="paint", question=1)
-    yield after(3.0)
-    photograph("question")
-    press("ESC", *ball)
+    yield from push("refgs.hint(kind='paint', question=1)", 0.7)
     yield after(2.0)
+    photograph("question")
+    yield from press("Escape", *middle())
     count("answered")
 
 
-act(artist())
+def make_picture():
+    """Make a ball of copper, light it by another panorama as the photos' light did, and save a picture of it."""
+    yield from add_edit("Sphere")
+    yield from push("refgs.remove_edit", 0.91, beside=MATERIALS, entry=COPPER)
+    report["edit"] = addon("scene.edit").edits(bpy.data.objects["still splats"])[0].name
+    yield from push("refgs.relight", beside=LIGHT, entry=SUNSET)
+    yield from push("refgs.match_light")
+    yield after(4.0)
+    photograph("relit")
+    report["relit"] = light()
+    yield from push("refgs.render_preview")
+    yield from choose_file(str(OUT), "relit ball.png")
+    yield lambda: jobs()[-1].ended
+    yield after(2.0)
+    photograph("picture")
+    report["picture"] = jobs()[-1].state, jobs()[-1].line
+
+
+act(artist(), pause=0.02)

@@ -119,9 +119,9 @@ def after(seconds):
     return lambda: time.monotonic() >= due
 
 
-def act(steps):
+def act(steps, pause=1.0):
     """Run a script's steps in the window. `steps` is a generator that yields conditions: functions that are called
-    again and again until they return true. Then the generator runs on to the next condition.
+    again and again until they return true, first after `pause` seconds. Then the generator runs on to the next condition.
 
     Blender quits after the last step, after an error, or if a wait takes longer than PATIENCE seconds.
     """
@@ -133,13 +133,13 @@ def act(steps):
             if waiting is None or waiting():
                 with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
                     waiting, begun = next(steps), time.monotonic()
-                return 1.0  # until Blender has handled the key
+                return pause  # until Blender has handled the key
             assert time.monotonic() < begun + PATIENCE, "waited in vain"
         except StopIteration:
             return quit_blender()
         except Exception:
             report["error"] = traceback.format_exc()
             return quit_blender()
-        return 0.2
+        return min(pause, 0.2)
 
     bpy.app.timers.register(tick, first_interval=3.0)
