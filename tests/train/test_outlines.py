@@ -37,7 +37,7 @@ def rendered(state, metallic: float) -> Step:
     picture = state.picture(state.inputs(), step.photo.camera)
     turn = torch.tensor([[0.9848, 0.1736, 0.0], [-0.1736, 0.9848, 0.0], [0.0, 0.0, 1.0]])
     material = picture.material.detach().clone()
-    material[..., outlines.METALLIC] = metallic
+    material[..., 3] = metallic
     step.rendering = replace(picture, normal=(picture.normal.detach() @ turn).requires_grad_(), material=material)
     return step
 

@@ -15,7 +15,7 @@ from refgs.geometry.project import inside, pixel_rays, project
 from refgs.geometry.shape import fitted
 from refgs.geometry.visibility import Occluder
 
-ACROSS = 200  # pixels across the object, in reduced masks and in maps of normals
+ACROSS = 200  # pixels across the object, in reduced masks and where normals are looked up
 TOUCHED = 1.0  # pixels from an outline, within which a ray touches the object
 LONG = 0.12  # of the hull's radius: half of the longest way that a ray may run along a surface that is known
 
@@ -50,7 +50,7 @@ def told(hull: SmoothMesh, alphas: Sequence[np.ndarray], cameras: Sequence[Camer
         way = np.zeros(len(touched))
         for direction in (rays, -rays):
             face, weights = within.meet(points, inward, direction)
-            corners = hull.vertices[hull.faces[face][:, ::-1]]
+            corners = within.mesh.vertices[within.mesh.faces[face]]
             left = np.linalg.norm(np.einsum("pka,pk->pa", corners, weights) - points, axis=1)
             way += np.where(face >= 0, left, 0) / 2
         longest[touched] = np.maximum(longest[touched], way)

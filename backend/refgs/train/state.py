@@ -125,10 +125,10 @@ class State:
 
     @property
     def losses(self) -> LossSettings:
-        """Return the loss weights, 0 for metallic and roughness terms without specular shading."""
+        """Return the loss weights, 0 for terms of metals and roughness without specular shading."""
         weights = self.settings.loss
         if self.settings.render.reflection == "none":
-            return weights.model_copy(update={"even": 0.0, "metallic": 0.0, "matte": 0.0})
+            return weights.model_copy(update={"even": 0.0, "metallic": 0.0, "matte": 0.0, "outlines": 0.0})
         return weights
 
     def surfels(self) -> Surfels:

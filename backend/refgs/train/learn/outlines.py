@@ -21,7 +21,6 @@ from refgs.train.part import Part
 from refgs.train.state import State
 from refgs.train.timeline import Step
 
-METALLIC = 3  # channel of a rendering's material
 WRONG = 0.03  # 1 − cosine of 14°, at which outlines are as likely wrong as the surface
 
 
@@ -47,7 +46,7 @@ class Outlines(Part):
 
 def load(state: State, hull: SmoothMesh | None) -> None:
     """Find the normals of the visual hull in all training views, where outlines tell them."""
-    if hull is None or state.settings.loss.outlines == 0:
+    if hull is None or not state.method.lit or state.settings.loss.outlines == 0:
         return
     with state.clock.part("start"):
         cameras = [view.camera for view in state.views]
@@ -68,13 +67,14 @@ def loss(state: State, step: Step) -> Tensor | None:
     place where 1 − the cosine is e, times metallic.
     """
     told, rendering, camera = state.part(Outlines).told.get(step.view), step.rendering, step.photo.camera
-    if told is None or rendering.material is None:
+    weight = state.losses.outlines
+    if told is None or rendering.material is None or weight == 0:
         return None
     column = (told.plane[:, 0] * camera.fx + camera.cx).floor().long()
     row = (told.plane[:, 1] * camera.fy + camera.cy).floor().long()
     shown = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     at = row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)
-    metal = rendering.material.detach()[..., METALLIC].flatten()[at]
+    metal = rendering.metallic.detach().flatten()[at]
     counts = shown * (rendering.alpha.detach().flatten()[at] > SOLID) * metal
     error = 1 - cosine_similarity(rendering.normal.flatten(0, 1)[at], told.normals, dim=1)
-    return state.settings.loss.outlines * told.part * (counts * error / (error + WRONG)).sum()
+    return weight * told.part * (counts * error / (error + WRONG)).sum()
