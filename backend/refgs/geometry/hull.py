@@ -126,7 +126,8 @@ def visual_hull_points(
     first = low + voxel * (0.5 - 3)
     outside = np.ascontiguousarray(faces[:, ::-1])  # seen from outside, corners go round anticlockwise
     surface = SmoothMesh(first + voxel * vertices, outside, outward)
-    return HullPoints(*(x.astype(np.float32) for x in (first + points, normals, spacing)), surface)
+    placed, normals, spacing = (x.astype(np.float32) for x in (first + points, normals, spacing))
+    return HullPoints(placed, normals, spacing, surface)
 
 
 def _normals(slope: list[np.ndarray], at: np.ndarray) -> np.ndarray:
