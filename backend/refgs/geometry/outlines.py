@@ -39,8 +39,8 @@ def told(hull: SmoothMesh, alphas: Sequence[np.ndarray], cameras: Sequence[Camer
     for alpha, full in zip(alphas, cameras, strict=True):
         camera = fitted(full, centre, radius, ACROSS)
         solid = cv2.resize(alpha, (camera.width, camera.height), interpolation=cv2.INTER_AREA) > 127
-        within_it, outside = (cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, 5) for part in (solid, ~solid))
-        apart = within_it + outside - 0.5
+        inner, outer = (cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, 5) for part in (solid, ~solid))
+        apart = inner + outer - 0.5
         pixels, depth = project(camera, hull.vertices)
         seen = np.flatnonzero(inside(camera, pixels, depth))
         column, row = np.minimum(pixels[seen].astype(int), (camera.width - 1, camera.height - 1)).T
