@@ -1,6 +1,5 @@
 """Bake the edits of a run into its mesh's textures, so that an edited mesh can be exported without the trainer."""
 
-import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +13,7 @@ from ..nodes.edit_tree import AMOUNT, COLOR, SURFACE
 from .atomic_file import unwritable
 from .color_spaces import to_rec709
 from .edit import evaluated_splats, splats_of
+from .glb_pictures import replace_pictures
 from .import_run import add_mesh, data_blocks
 from .mesh_exchange import TEXTURES, textures_of
 from .pictures import read_png, write_png
@@ -29,14 +29,16 @@ def bake_edits(collection: bpy.types.Collection, mesh: Path, folder: Path) -> Pa
 
     `mesh` is the mesh.glb of the run folder. The textures get what the mesh shows in Blender: each vertex has the edits of the nearest
     splat, and they are linear in between. Texels without edits keep their bytes. Shape, uv map, tangents, normal and occlusion textures
-    stay. The float EXR files of edited textures are left out. Splats that were deleted stay in the mesh.
+    stay. The float EXR files of edited textures are left out. Splats that were deleted stay in the mesh. If there is no folder of textures
+    beside the mesh, its own pictures are taken.
 
     Raises InputError if a texture is missing, if the mesh has no uv map, or if it is not one that RefGS wrote.
     """
-    files, target, packed = textures_of(mesh), folder / TEXTURES, folder / "packed.png"
+    target, packed = folder / TEXTURES, folder / "packed.png"
     places, faces, uv = _triangles(mesh)
     values = _edits_at(splats_of(collection), places)
     try:
+        files = textures_of(mesh, target)
         pictures = {name: read_png(files[name]) for name in (*EDITED, "occlusion")}
         if len({picture.shape for picture in pictures.values()}) > 1:
             raise InputError(f"the textures beside {mesh} differ in size: make the run's mesh again")
@@ -44,14 +46,14 @@ def bake_edits(collection: bpy.types.Collection, mesh: Path, folder: Path) -> Pa
             edit = np.einsum("pc,pcv->pv", weights, values[faces[triangles]])
             for name, new, amount in zip(EDITED, ([0, 1, 2], [3], [4]), ([5], [6], [7]), strict=True):
                 _blend(pictures[name], texels, edit[:, new], edit[:, amount], srgb=name == "base_color")
-        shutil.copytree(
-            mesh.parent / TEXTURES, target, ignore=shutil.ignore_patterns(*(f"{name}.*" for name in EDITED))
-        )
+        if not target.exists():
+            edited = shutil.ignore_patterns(*(f"{name}.*" for name in EDITED))
+            shutil.copytree(mesh.parent / TEXTURES, target, ignore=edited)
         for name in EDITED:
             write_png(target / f"{name}.png", pictures[name][..., :3])
         channels = [pictures[name][..., :1] for name in ("occlusion", "roughness", "metallic")]
         write_png(packed, np.concatenate(channels, axis=2))
-        (folder / mesh.name).write_bytes(_with_pictures(mesh, target / "base_color.png", packed))
+        (folder / mesh.name).write_bytes(replace_pictures(mesh, target / "base_color.png", packed))
         packed.unlink()
     except (OSError, RuntimeError) as error:
         raise unwritable(folder / mesh.name, error) from None
@@ -186,31 +188,3 @@ def _blend(picture: np.ndarray, texels: np.ndarray, added: np.ndarray, amount: n
     learned = flat[rows, :3]
     mixed = (srgb_to_linear(learned) if srgb else learned) * (1 - amount) + added
     flat[rows, :3] = linear_to_srgb(mixed) if srgb else mixed.clip(0, 1)
-
-
-def _with_pictures(mesh: Path, base_color: Path, packed: Path) -> bytes:
-    """Return a binary glTF file with other pictures for base colour and for occlusion, roughness and metallic."""
-    data = mesh.read_bytes()
-    try:
-        length = int.from_bytes(data[12:16], "little")
-        tree, buffer = json.loads(data[20 : 20 + length]), data[28 + length :]
-        material = tree["materials"][0]["pbrMetallicRoughness"]
-        new = {}
-        for key, file in (("baseColorTexture", base_color), ("metallicRoughnessTexture", packed)):
-            image = tree["images"][tree["textures"][material[key]["index"]]["source"]]
-            image["mimeType"] = "image/png"
-            new[image["bufferView"]] = file.read_bytes()
-        whole = bytearray()
-        for number, view in enumerate(tree["bufferViews"]):
-            start = view.get("byteOffset", 0)
-            part = new.get(number, buffer[start : start + view["byteLength"]])
-            view["byteOffset"], view["byteLength"] = len(whole), len(part)
-            whole += part + bytes(-len(part) % 4)
-        tree["buffers"][0]["byteLength"] = len(whole)
-    except (ValueError, KeyError, IndexError, TypeError):
-        raise InputError(f"{mesh} is not a mesh that RefGS wrote: make the run's mesh again") from None
-    text = json.dumps(tree, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = [len(text).to_bytes(4, "little"), b"JSON", text, len(whole).to_bytes(4, "little"), b"BIN\0", bytes(whole)]
-    size = 12 + sum(map(len, chunks))
-    return b"".join([b"glTF", (2).to_bytes(4, "little"), size.to_bytes(4, "little"), *chunks])

@@ -16,6 +16,7 @@ from .atomic_file import atomic_write
 from .bake_edits import bake_edits
 from .color_spaces import to_rec709
 from .edit import edits, evaluated_splats, is_edited, splats_of
+from .glb_pictures import has_pictures
 from .mesh_exchange import TEXTURES, write_mesh
 from .run_parts import FOLDER, folder_of
 from .splat_cloud import MATERIALS, SH_DC, finite_rows, linear_to_srgb, read_constants, srgb_to_linear
@@ -117,7 +118,7 @@ def export_run(collection: bpy.types.Collection, folder: Path, bake: bool = True
             shutil.copy2(mesh, temporary / mesh.name)
             if textures.is_dir():
                 shutil.copytree(textures, temporary / TEXTURES)
-        elif bake and mesh.is_file() and textures.is_dir():
+        elif bake and mesh.is_file() and (textures.is_dir() or has_pictures(mesh)):
             bake_edits(collection, mesh, temporary)
         temporary.chmod(0o755)  # mkdtemp makes folders that only the owner can read
         os.replace(temporary, folder)

@@ -13,6 +13,7 @@ from ..nodes import add, out, principled
 from ..nodes.splat_material import SPECULAR
 from .atomic_file import unwritable
 from .color_spaces import SRGB, set_color_space
+from .glb_pictures import unpack_pictures
 from .import_run import add_mesh, data_blocks
 
 TEXTURES = "textures"  # folder beside a run's mesh.glb
@@ -36,14 +37,13 @@ def write_mesh(mesh: Path, path: Path, engine: str = "Any Program") -> None:
     `engine` is the game engine for which extra textures are written to the same folder: "Unreal", "Unity", or "Any Program" for none. The
     open .blend does not change. Raises InputError if a texture is missing, or if a file cannot be read or written.
     """
-    sources = textures_of(mesh)
     before = data_blocks()
     try:
         # All is made in a folder of its own: with MaterialX, Blender leaves a second copy of the textures beside the file.
         with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as work:
             made, folder = Path(work, path.name), Path(work, f"{path.stem} {TEXTURES}")
             folder.mkdir()
-            for name, source in sources.items():
+            for name, source in textures_of(mesh, Path(work, "inside")).items():
                 shutil.copyfile(source, folder / f"{name}.png")
             for name, channels in PACKED[engine].items():
                 _pack(folder / f"{name}.png", folder, channels)
@@ -67,8 +67,13 @@ def write_mesh(mesh: Path, path: Path, engine: str = "Any Program") -> None:
         bpy.data.batch_remove(data_blocks() - before)
 
 
-def textures_of(mesh: Path) -> dict[str, Path]:
-    """Return the PNG textures beside a run's mesh.glb by name. Raises InputError if one is missing."""
+def textures_of(mesh: Path, folder: Path) -> dict[str, Path]:
+    """Return a run's PNG textures by name: those beside its mesh.glb, or else those inside it, which are written into the new `folder`.
+
+    Raises InputError if the folder beside the mesh lacks one, or the mesh has none.
+    """
+    if not (mesh.parent / TEXTURES).is_dir():
+        return unpack_pictures(mesh, folder)
     files = {name: mesh.parent / TEXTURES / f"{name}.png" for name in (*_PICTURES, "occlusion")}
     for file in files.values():
         if not file.is_file():

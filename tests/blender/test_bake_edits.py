@@ -12,6 +12,7 @@ from PIL import Image
 from refgs.color import srgb_decode, srgb_encode
 from refgs.formats.gltf import write_glb
 from refgs_addon import compat, jobs
+from refgs_addon.errors import InputError
 from refgs_addon.nodes.edit_tree import AMOUNT, COLOR, SURFACE
 from refgs_addon.scene.bake_edits import bake_edits
 from refgs_addon.scene.edit import add_edit
@@ -20,7 +21,7 @@ from refgs_addon.scene.import_run import data_blocks, import_run
 from refgs_addon.scene.run_parts import show
 from refgs_addon.trainer import preferences
 from tests.makers.blender import attribute
-from tests.makers.box import SIZE, glb_chunks, textured_box
+from tests.makers.box import SIZE, glb_chunks, rewrite_glb, textured_box
 from tests.makers.runs import random_columns, write_ply
 
 COUNT = 4000
@@ -174,11 +175,7 @@ def test_what_is_missing_is_said_before_a_file_is_chosen(box, run_folder, addon,
     others = [bpy.ops.refgs.export_splats, bpy.ops.refgs.apply_edits]
     assert all(export.poll() for export in (*exports, bpy.ops.refgs.export_light, *others))
     assert not bpy.ops.refgs.export_display_splats.poll()  # no trainer is set up
-    (run_folder / "textures").rename(run_folder / "away")
-    assert [export.poll() for export in exports] == [True, False, False]
     add_edit(box[0].collection)
-    assert not exports[0].poll()
-    (run_folder / "away").rename(run_folder / "textures")
     for number, export in enumerate(exports):
         export(filepath=str(tmp_path / f"{number}{ENDINGS[number]}"))
         assert (tmp_path / f"{number}{ENDINGS[number]}").stat().st_size
@@ -193,6 +190,38 @@ def test_what_is_missing_is_said_before_a_file_is_chosen(box, run_folder, addon,
         (run_folder / name).rename(run_folder / f"{name} away")
         assert not any(export.poll() for export in blocked)
         (run_folder / f"{name} away").rename(run_folder / name)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_without_textures_beside_the_mesh_those_inside_it_are_taken(box, run_folder, tmp_path, ending):
+    run, _ = box
+    upper_half(run)
+    for folder in ("beside", "inside"):
+        (tmp_path / folder).mkdir()
+    export_mesh(run.collection, tmp_path / "beside" / f"a{ending}")
+    (run_folder / "textures").rename(tmp_path / "away")
+    export_mesh(run.collection, tmp_path / "inside" / f"a{ending}")
+    if ending == ".glb":
+        for one, other in zip(*(pictures(tmp_path / folder / "a.glb") for folder in ("beside", "inside")), strict=True):
+            np.testing.assert_array_equal(one, other)
+    else:
+        beside, inside = (textures(tmp_path / folder / "a textures") for folder in ("beside", "inside"))
+        for name in beside:
+            np.testing.assert_array_equal(beside[name], inside[name])
+    assert not (run_folder / "textures").exists()
+    export_run(run.collection, tmp_path / "new")
+    assert (tmp_path / "new" / "mesh.glb").is_file() and (tmp_path / "new" / "textures" / "normal.png").is_file()
+
+
+def test_a_mesh_without_pictures_is_refused_in_one_line(box, run_folder, tmp_path):
+    run, _ = box
+    add_edit(run.collection)
+    (run_folder / "textures").rename(tmp_path / "away")
+    rewrite_glb(run_folder / "mesh.glb", lambda tree: tree["materials"][0].pop("normalTexture"))
+    with pytest.raises(InputError, match="not a mesh that RefGS wrote: make the run's mesh again"):
+        export_mesh(run.collection, tmp_path / "a.glb")
+    export_run(run.collection, tmp_path / "new")
+    assert not (tmp_path / "new" / "mesh.glb").exists()
 
 
 def test_a_new_run_has_a_mesh_by_the_trainer_where_it_is_set_up(box, addon, python, tmp_path):
