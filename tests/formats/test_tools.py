@@ -18,7 +18,7 @@ from refgs.formats.mesh import Y_UP
 from refgs.formats.splats import Splats, read_splats, three_scales, write_display_splats, write_splats
 from refgs.formats.splats_gltf import write_splats_glb
 from refgs.formats.spz import read_spz, write_spz
-from tests.makers.box import glb_chunks, textured_box
+from tests.makers.box import glb_chunks, rewrite_glb, textured_box
 from tests.makers.splats import arrays
 
 TOOLS = Path(__file__).parents[1] / "tools"
@@ -170,14 +170,53 @@ def test_gltf_of_splats(tmp_path, degree):
     np.testing.assert_allclose(ours["COLOR_0"][:, 3:], ours["KHR_gaussian_splatting:OPACITY"], atol=1e-6)
 
 
+def issues_in(file):
+    """Return the errors and warnings that Khronos's validator finds in a glTF file, and what it says of its contents."""
+    report = json.loads(said("validate.js", file))
+    return [m for m in report["issues"]["messages"] if m["severity"] < 2], report["info"]
+
+
 def test_gltf_of_splats_is_valid(tmp_path):
-    write_splats_glb(tmp_path / "des éclats.glb", discs())
-    report = json.loads(said("validate.js", tmp_path / "des éclats.glb"))
-    issues = [m for m in report["issues"]["messages"] if m["severity"] < 2]
-    # The validator does not know the extension yet, nor the names that it gives attributes.
+    """Check what the validator can judge. It does not know the extension yet: neither its object nor the names that it gives attributes."""
+    file = tmp_path / "des éclats.glb"
+    write_splats_glb(file, discs())
+    issues, facts = issues_in(file)
     assert {m["code"] for m in issues} == {"MESH_PRIMITIVE_INVALID_ATTRIBUTE"}
     assert all("attributes/KHR_gaussian_splatting:" in m["pointer"] for m in issues)
-    assert len(issues) == 3 + 16 and report["info"]["totalVertexCount"] == COUNT
+    assert len(issues) == 3 + 16 and facts["totalVertexCount"] == COUNT
+
+    def rename(gltf):
+        (primitive,) = gltf["meshes"][0]["primitives"]
+        for name in [*primitive["attributes"]]:
+            if name.startswith("KHR"):
+                primitive["attributes"][f"_{name.partition(':')[2]}"] = primitive["attributes"].pop(name)
+
+    # Under names of our own, it checks all that the attributes' numbers are stored in.
+    rewrite_glb(file, rename)
+    issues, facts = issues_in(file)
+    assert issues == [] and facts["hasSkins"] is False and facts["maxAttributes"] == 5 + 16 + 3
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_gltf_of_splats_keeps_the_rules_of_the_extension(tmp_path, degree):
+    """Check the rules that the extension's text has for attributes, which no validator checks yet."""
+    splats = discs(degree=degree)
+    write_splats_glb(tmp_path / "a.glb", splats)
+    gltf, _ = glb_chunks(tmp_path / "a.glb")
+    (primitive,) = gltf["meshes"][0]["primitives"]
+    prefix = "KHR_gaussian_splatting:"
+    assert gltf["extensionsUsed"] == [prefix[:-1]] and primitive["mode"] == 0
+    assert primitive["extensions"] == {prefix[:-1]: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
+    wanted = {"ROTATION": "VEC4", "SCALE": "VEC3", "OPACITY": "SCALAR"}
+    wanted |= {f"SH_DEGREE_{d}_COEF_{n}": "VEC3" for d in range(degree + 1) for n in range(2 * d + 1)}
+    accessors = {name: gltf["accessors"][number] for name, number in primitive["attributes"].items()}
+    found = {name.removeprefix(prefix): accessor for name, accessor in accessors.items() if name.startswith(prefix)}
+    assert {name: accessor["type"] for name, accessor in found.items()} == wanted
+    assert all(accessor["componentType"] == 5126 and accessor["count"] == COUNT for accessor in accessors.values())
+    values, _ = vertex_attributes(tmp_path / "a.glb")
+    np.testing.assert_allclose(np.linalg.norm(values[f"{prefix}ROTATION"], axis=1), 1, atol=1e-6)
+    assert (values[f"{prefix}SCALE"] > 0).all()
+    assert values[f"{prefix}OPACITY"].min() >= 0 and values[f"{prefix}OPACITY"].max() <= 1
 
 
 @pytest.mark.parametrize("version", ["3", "4"])
@@ -202,6 +241,5 @@ def test_another_program_reads_our_spz(tmp_path):
 def test_the_mesh_is_valid_gltf(tmp_path, specular):
     mesh, textures = textured_box()
     write_glb(tmp_path / "un maillage.glb", mesh, replace(textures, specular=specular))
-    report = json.loads(said("validate.js", tmp_path / "un maillage.glb"))
-    issues = [(m["code"], m["message"], m.get("pointer")) for m in report["issues"]["messages"] if m["severity"] < 2]
-    assert report["info"]["totalTriangleCount"] == len(mesh.faces) and not issues
+    issues, facts = issues_in(tmp_path / "un maillage.glb")
+    assert facts["totalTriangleCount"] == len(mesh.faces) and issues == []
