@@ -3,6 +3,7 @@
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 
@@ -11,6 +12,9 @@ from ..nodes.panorama_world import RECOVERED, get_light, is_panorama, set_light
 from .atomic_file import atomic_write
 from .render_eevee import render_preview
 from .world_light import correct_diffuse, relight
+
+if TYPE_CHECKING:
+    import numpy as np
 
 GAP = 4  # pixels between pictures
 
@@ -30,9 +34,7 @@ def contact_sheet(
     finished pictures and the name of the next light. The scene's light is restored. Raises InputError if there is no camera, if there is no
     light, if a light cannot be read, or if the file cannot be written.
     """
-    import numpy as np  # Debian's Blender may lack it
-
-    from .pictures import read_png, write_png
+    from .pictures import read_png, write_png  # needs numpy, which Debian's Blender may lack
 
     world = scene.world
     known = is_panorama(world) and world.get(RECOVERED) is not None
@@ -62,6 +64,14 @@ def contact_sheet(
             if world is not None:
                 world.use_fake_user = kept
     progress(len(lights), "layout")
+    with atomic_write(png) as temporary:
+        write_png(temporary, _sheet(pictures))
+
+
+def _sheet(pictures: "list[np.ndarray]") -> "np.ndarray":
+    """Put pictures (H, W, 4) of one size in rows, on a transparent, roughly square sheet."""
+    import numpy as np
+
     height, width = pictures[0].shape[:2]
     columns = max(1, round((len(pictures) * height / width) ** 0.5))
     rows = -(-len(pictures) // columns)
@@ -70,5 +80,4 @@ def contact_sheet(
         row, column = divmod(number, columns)
         top, left = row * (height + GAP), column * (width + GAP)
         sheet[top : top + height, left : left + width] = picture
-    with atomic_write(png) as temporary:
-        write_png(temporary, sheet)
+    return sheet

@@ -59,67 +59,26 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     In the folder's place may be a file of splats, .ply or .spz. Splats of other programs have no materials and become matte. Their normals
     are their shortest axes, which may point to either side, and are turned to the viewer.
     """
-    folder = Path(folder)
-    alone = folder.suffix.lower() in THEIRS and folder.is_file()
-    if not alone and not folder.is_dir():
-        raise InputError(f"{folder} is not a folder: choose the folder that a training wrote")
-    if not alone and not os.path.lexists(folder / "splats.ply"):
-        if jobs.run_state(folder):
-            raise InputError(f"the training of {folder} has not ended: wait for it, or resume it")
-        raise InputError(f"{folder} is not a run: it has no splats.ply. Choose the folder that a training wrote")
-    # Not resolved: by a link's target, a copied project would find the original's run.
-    folder = Path(os.path.abspath(folder))
-    name, file = (folder.stem, folder) if alone else (folder.name, folder / "splats.ply")
-    splats, left_out = read_splats(file)
-    theirs = not is_ours(file)
+    folder, file = _run_and_splats(Path(folder))
+    name = folder.stem if folder == file else folder.name
     capture = capture_of(folder)
     frames = read_cameras(folder / "cameras.json", capture) if (folder / "cameras.json").exists() else []
     before, world, camera = data_blocks(), scene.world, scene.camera
     try:
-        collection = bpy.data.collections.new(f"RefGS {name}")
-        if not alone:
-            collection[run_parts.FOLDER] = str(folder)
-        if theirs:
-            collection[run_parts.THEIRS] = True
-        if words := _doubt_words(folder):
-            collection[run_parts.DOUBT] = words
-        scene.collection.children.link(collection)
-        cloud = point_cloud(f"{name} splats", cloud_attributes(splats, *normal_slopes(splats)))
-        drawn = add_splats(cloud.name, cloud, collection, {} if theirs else read_constants(file), theirs)
-        drawn[run_parts.KEY] = "splats"
-        mesh = add_mesh(folder / "mesh.glb", f"{name} mesh", collection) if (folder / "mesh.glb").exists() else []
-        run = Run(collection, add_root(f"RefGS {name}", drawn, mesh), drawn, left_out, mesh)
+        run = _add_splats_and_mesh(folder, file, scene, name)
         if (folder / "environment.exr").exists():
-            light = load_panorama(folder / "environment.exr")
-            run.light_is_rec709 = set_color_space(light, LINEAR_REC709)
-            light.pack()  # the .blend keeps it where the run folder is moved or deleted
-            run.world = light_with_recovered(scene, f"RefGS {name}", light)
-            run.light_of = light_of(folder / "cameras.json") if frames else ""
-            if run.light_of:
-                run.world["refgs_light_of"] = run.light_of
+            _light_with_own(run, folder, scene, name)
         if frames:
-            cameras = bpy.data.collections.new(f"{name} cameras")
-            cameras[run_parts.CAMERAS] = cameras.hide_viewport = True  # a hundred cameras hide the object
-            collection.children.link(cameras)
-            run.cameras = {frame["name"]: add_camera(frame, cameras) for frame in frames}
-            # Blender draws a dashed line from each camera to its parent, unless that is hidden.
-            holder = bpy.data.objects.new(cameras.name, None)
-            holder.hide_viewport = True
-            holder.parent, holder.matrix_parent_inverse = run.root, Matrix.Translation(-run.root.location)
-            cameras.objects.link(holder)
-            for camera in run.cameras.values():
-                camera.parent = holder
-            if scene.camera is None:
-                frame_camera(scene, next(iter(run.cameras.values())))
-        for item in (drawn, *mesh):
+            _add_cameras(run, frames, scene, name)
+        for item in (run.splats, *run.mesh):
             item.parent, item.matrix_parent_inverse = run.root, Matrix.Translation(-run.root.location)
-        for material in {material for item in (drawn, *mesh) for material in item.data.materials}:
+        for material in {material for item in (run.splats, *run.mesh) for material in item.data.materials}:
             add_world_diffuse(material, _occlusion(material))
         correct_diffuse(scene)
         solid = [item for item in run.mesh if item.data.polygons]
         if solid:
-            put_under(solid, drawn)
-        run_parts.show(collection, "mesh" if solid else "splats")
+            put_under(solid, run.splats)
+        run_parts.show(run.collection, "mesh" if solid else "splats")
     except BaseException:
         scene.world, scene.camera = world, camera
         bpy.data.batch_remove(data_blocks() - before)
@@ -130,6 +89,68 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     if capture is not None and frames:
         replace_cameras(scene, capture, run.cameras)
     return run
+
+
+def _run_and_splats(folder: Path) -> tuple[Path, Path]:
+    """Return the absolute paths of a run folder and its splats.ply. Of a file of splats, both are the file's. Raises InputError."""
+    # Not resolved: by a link's target, a copied project would find the original's run.
+    absolute = Path(os.path.abspath(folder))
+    if folder.suffix.lower() in THEIRS and folder.is_file():
+        return absolute, absolute
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder: choose the folder that a training wrote")
+    if not os.path.lexists(folder / "splats.ply"):
+        if jobs.run_state(folder):
+            raise InputError(f"the training of {folder} has not ended: wait for it, or resume it")
+        raise InputError(f"{folder} is not a run: it has no splats.ply. Choose the folder that a training wrote")
+    return absolute, absolute / "splats.ply"
+
+
+def _add_splats_and_mesh(folder: Path, file: Path, scene: bpy.types.Scene, name: str) -> Run:
+    """Add a collection with a run's splats, which are in `file`, its mesh and the Empty that will move them."""
+    splats, left_out = read_splats(file)
+    theirs = not is_ours(file)
+    collection = bpy.data.collections.new(f"RefGS {name}")
+    if file != folder:
+        collection[run_parts.FOLDER] = str(folder)
+    if theirs:
+        collection[run_parts.THEIRS] = True
+    if words := _doubt_words(folder):
+        collection[run_parts.DOUBT] = words
+    scene.collection.children.link(collection)
+    cloud = point_cloud(f"{name} splats", cloud_attributes(splats, *normal_slopes(splats)))
+    drawn = add_splats(cloud.name, cloud, collection, {} if theirs else read_constants(file), theirs)
+    drawn[run_parts.KEY] = "splats"
+    mesh = add_mesh(folder / "mesh.glb", f"{name} mesh", collection) if (folder / "mesh.glb").exists() else []
+    return Run(collection, add_root(f"RefGS {name}", drawn, mesh), drawn, left_out, mesh)
+
+
+def _light_with_own(run: Run, folder: Path, scene: bpy.types.Scene, name: str) -> None:
+    """Light the scene with the panorama that was recovered from the run's photos."""
+    light = load_panorama(folder / "environment.exr")
+    run.light_is_rec709 = set_color_space(light, LINEAR_REC709)
+    light.pack()  # the .blend keeps it where the run folder is moved or deleted
+    run.world = light_with_recovered(scene, f"RefGS {name}", light)
+    run.light_of = light_of(folder / "cameras.json") if (folder / "cameras.json").exists() else ""
+    if run.light_of:
+        run.world["refgs_light_of"] = run.light_of
+
+
+def _add_cameras(run: Run, frames: list[dict], scene: bpy.types.Scene, name: str) -> None:
+    """Add a hidden collection with a run's cameras. The first one becomes the scene's camera if there is none."""
+    cameras = bpy.data.collections.new(f"{name} cameras")
+    cameras[run_parts.CAMERAS] = cameras.hide_viewport = True  # a hundred cameras hide the object
+    run.collection.children.link(cameras)
+    run.cameras = {frame["name"]: add_camera(frame, cameras) for frame in frames}
+    # Blender draws a dashed line from each camera to its parent, unless that is hidden.
+    holder = bpy.data.objects.new(cameras.name, None)
+    holder.hide_viewport = True
+    holder.parent, holder.matrix_parent_inverse = run.root, Matrix.Translation(-run.root.location)
+    cameras.objects.link(holder)
+    for camera in run.cameras.values():
+        camera.parent = holder
+    if scene.camera is None:
+        frame_camera(scene, next(iter(run.cameras.values())))
 
 
 def add_root(name: str, splats: bpy.types.Object, mesh: list[bpy.types.Object]) -> bpy.types.Object:

@@ -129,6 +129,38 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
     found = set(rows.dtype.names)
     ours = not found.isdisjoint(MATERIALS[:4])  # others have a roughness, too
     constants = read_constants(path) if ours else {}
+    names = _columns(found, ours, constants, path)
+    splats = {key: np.stack([rows[name] for name in group], axis=-1) for key, group in names.items()}
+    splats = {key: value[:, 0] if value.shape[1] == 1 else value for key, value in splats.items()}
+    splats = {key: value.astype(np.float32, copy=False) for key, value in splats.items()}
+    splats["opacity"] = 1 / (1 + np.exp(-splats["opacity"]))
+    splats["scale"] = np.exp(splats["scale"])
+    splats["rotation"] /= np.maximum(np.linalg.norm(splats["rotation"], axis=1, keepdims=True), 1e-12)
+    for name in {*MATERIALS[3:]} & {*constants}:
+        splats[name] = np.full_like(splats["opacity"], constants[name])
+    look = splats.pop("look")
+    if not ours and "base_color" in splats:
+        for name in ("base_color", "metallic", "roughness"):
+            splats[name] = 1 / (1 + np.exp(-splats[name]))
+        splats["base_color"] = srgb_to_linear(splats["base_color"])
+    elif not ours:
+        splats["base_color"] = srgb_to_linear((0.5 + SH_DC * look).clip(0, 1))
+        splats |= {name: np.full_like(splats["opacity"], SURFACE[name]) for name in MATERIALS[3:]}
+    if "scale_2" in found:
+        splats["rotation"], splats["scale"] = _flatten_gaussians(splats["rotation"], splats["scale"])
+    normal = splats.setdefault("normal", np.zeros_like(splats["position"]))
+    none = ~normal.any(axis=1)
+    w, x, y, z = splats["rotation"][none].T
+    normal[none] = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return splats, len(all_rows) - len(rows)
+
+
+def _columns(found: set[str], ours: bool, constants: dict[str, float], path: Path) -> dict[str, list[str]]:
+    """Return the columns to read of a file of splats by what they hold, from the columns `found`. Raises InputError if some are missing.
+
+    `ours` tells whether RefGS made the materials. Those in `constants` have no column.
+    """
     names = {
         "position": ["x", "y", "z"],
         "scale": ["scale_0", "scale_1", *(["scale_2"] if "scale_2" in found else [])],
@@ -154,30 +186,7 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
         if len(numbers) not in counts or numbers != {f"{prefix}{i}" for i in range(len(numbers))}:
             known = ", ".join(map(str, counts))
             raise InputError(f"{path} has {len(numbers)} {prefix} values a splat: spherical harmonics have {known}")
-    splats = {key: np.stack([rows[name] for name in group], axis=-1) for key, group in names.items()}
-    splats = {key: value[:, 0] if value.shape[1] == 1 else value for key, value in splats.items()}
-    splats = {key: value.astype(np.float32, copy=False) for key, value in splats.items()}
-    splats["opacity"] = 1 / (1 + np.exp(-splats["opacity"]))
-    splats["scale"] = np.exp(splats["scale"])
-    splats["rotation"] /= np.maximum(np.linalg.norm(splats["rotation"], axis=1, keepdims=True), 1e-12)
-    for name in {*MATERIALS[3:]} & {*constants}:
-        splats[name] = np.full_like(splats["opacity"], constants[name])
-    look = splats.pop("look")
-    if not ours and "base_color" in splats:
-        for name in ("base_color", "metallic", "roughness"):
-            splats[name] = 1 / (1 + np.exp(-splats[name]))
-        splats["base_color"] = srgb_to_linear(splats["base_color"])
-    elif not ours:
-        splats["base_color"] = srgb_to_linear((0.5 + SH_DC * look).clip(0, 1))
-        splats |= {name: np.full_like(splats["opacity"], SURFACE[name]) for name in MATERIALS[3:]}
-    if "scale_2" in found:
-        splats["rotation"], splats["scale"] = _flatten_gaussians(splats["rotation"], splats["scale"])
-    normal = splats.setdefault("normal", np.zeros_like(splats["position"]))
-    none = ~normal.any(axis=1)
-    w, x, y, z = splats["rotation"][none].T
-    normal[none] = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    return splats, len(all_rows) - len(rows)
+    return names
 
 
 def is_ours(path: Path) -> bool:

@@ -211,18 +211,39 @@ def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job, wid
     draw_capture(box, scene, job)
     if file := job.results.get("export", {}).get("display_splats"):
         wrapped_text(box, f"Wrote {file}", width)
-    if job.curve:
-        facts = job.progress
-        box.label(text=f"{facts['psnr']:.1f} dB{f', held out {job.held_out[-1][1]:.1f} dB' if job.held_out else ''}")
-        box.label(text=f"{facts['splats'] / 1000:.1f} k splats after {_duration(facts['seconds'])}")
-        if shown := curve_icon(job):
-            box.template_icon(icon_value=shown, scale=6)
-            ends = box.row()
-            ends.label(text=_duration(min(seconds for seconds, _ in job.curve + job.held_out)))
-            ends.label(text="log time")
-            ends.label(text=_duration(job.curve[-1][0]))
+    _draw_curve(box, job)
     if shown := preview_icon(job):
         box.template_icon(icon_value=shown, scale=10)
+    _draw_controls(box, job)
+    if job.no_cameras:
+        box.operator(FindCameras.bl_idname, icon="OUTLINER_OB_CAMERA")
+    elif job.state == "failed":
+        box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
+    for decision in job.decided.values():
+        wrapped_text(box, decision[0].upper() + decision[1:], width, "DOT")
+    if job.run and job.ended:
+        _draw_run(box, scene, job.run, width)
+    elif job.run:
+        draw_decisions(box, scene, job.run, width)
+
+
+def _draw_curve(box: bpy.types.UILayout, job: jobs.Job) -> None:
+    """Draw how good a training is by now, and its curve of error against time."""
+    if not job.curve:
+        return
+    facts = job.progress
+    box.label(text=f"{facts['psnr']:.1f} dB{f', held out {job.held_out[-1][1]:.1f} dB' if job.held_out else ''}")
+    box.label(text=f"{facts['splats'] / 1000:.1f} k splats after {_duration(facts['seconds'])}")
+    if shown := curve_icon(job):
+        box.template_icon(icon_value=shown, scale=6)
+        ends = box.row()
+        ends.label(text=_duration(min(seconds for seconds, _ in job.curve + job.held_out)))
+        ends.label(text="log time")
+        ends.label(text=_duration(job.curve[-1][0]))
+
+
+def _draw_controls(box: bpy.types.UILayout, job: jobs.Job) -> None:
+    """Draw the buttons that pause, finish, stop, show or keep a job."""
     if job.run and job.state in ("running", "paused") and "train" not in job.results:
         row = box.row(align=True)
         if job.state == "paused":
@@ -239,16 +260,6 @@ def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job, wid
     if job.run and not job.ended:
         icon = "CHECKBOX_HLT" if job.kept else "CHECKBOX_DEHLT"
         box.operator(KeepTraining.bl_idname, icon=icon, emboss=False).serial = job.serial
-    if job.no_cameras:
-        box.operator(FindCameras.bl_idname, icon="OUTLINER_OB_CAMERA")
-    elif job.state == "failed":
-        box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
-    for decision in job.decided.values():
-        wrapped_text(box, decision[0].upper() + decision[1:], width, "DOT")
-    if job.run and job.ended:
-        _draw_run(box, scene, job.run, width)
-    elif job.run:
-        draw_decisions(box, scene, job.run, width)
 
 
 def _draw_photos(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job, width: int) -> None:
