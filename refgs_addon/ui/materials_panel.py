@@ -44,6 +44,15 @@ class ShowDoubt(OnRun, bpy.types.Operator):
 
     on: BoolProperty(name="Show", default=True)
 
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not super().poll(context):
+            return False
+        cls.poll_message_set(
+            "This run does not say where photos do not tell: they tell everywhere, or it is of an earlier RefGS"
+        )
+        return has_doubt(active_run(context))
+
     def work(self, context: bpy.types.Context) -> None:
         show_doubt(active_run(context), self.on)
         if self.on:

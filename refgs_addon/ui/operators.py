@@ -296,8 +296,9 @@ class Photo(ReportsErrors, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("The scene's camera does not belong to an imported run or a checked capture")
-        return context.scene.camera is not None and PHOTO in context.scene.camera.data
+        cls.poll_message_set("The scene's camera has no photo: choose one of an imported run or of a checked capture")
+        camera = context.scene.camera
+        return camera is not None and camera.type == "CAMERA" and bool(camera.data.get(PHOTO))
 
     def work(self, context: bpy.types.Context) -> None:
         camera = context.scene.camera

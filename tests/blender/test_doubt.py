@@ -125,8 +125,9 @@ def test_the_panel_says_it_and_has_a_toggle(doubtful, addon):
 
 
 def test_the_panel_does_not_ask_for_what_a_run_does_not_say(run_folder, addon):
+    assert not bpy.ops.refgs.show_doubt.poll()
     import_run(run_folder, addon)
-    assert drawn(addon) == ([], {})
+    assert drawn(addon) == ([], {}) and not bpy.ops.refgs.show_doubt.poll()
 
 
 def test_a_picture_of_the_mesh_has_both_colors(doubtful, scene, tmp_path):
