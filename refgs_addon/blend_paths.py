@@ -17,10 +17,11 @@ from .errors import InputError
 from .nodes.panorama_world import get_light, is_panorama
 from .scene.camera_objects import MASK, PHOTO, STROKES
 from .scene.capture_cameras import CAPTURE
-from .scene.run_parts import FOLDER
+from .scene.run_parts import EXAMPLE, FOLDER
 
 SAVED = "refgs_saved"  # custom property of a scene: the file that it was saved in
 BORROWED = "refgs_borrowed"  # custom property of a scene, JSON: folders of another .blend, of which this one is a copy, and that .blend
+_EXAMPLE_END = "/" + "/".join(EXAMPLE.parts[-3:])
 
 
 def check_own(scene: bpy.types.Scene, folder: Path) -> None:
@@ -68,15 +69,28 @@ def _custom_properties() -> Iterator[tuple[bpy.types.ID, str]]:
 
 
 def _settings() -> Iterator[tuple[bpy.types.PropertyGroup, str]]:
-    for scene in bpy.data.scenes:
-        if scene.library is None:
-            yield from ((scene.refgs, "capture"), (scene.refgs, "out"))
-            yield from ((scene.refgs.many, "captures"), (scene.refgs.many, "results"))
-            yield from ((known, key) for known in scene.refgs.runs for key in ("folder", "capture"))
+    for scene in _own_scenes():
+        yield from ((scene.refgs, "capture"), (scene.refgs, "out"))
+        yield from ((scene.refgs.many, "captures"), (scene.refgs.many, "results"))
+        yield from ((known, key) for known in scene.refgs.runs for key in ("folder", "capture"))
+
+
+def _own_scenes() -> list[bpy.types.Scene]:
+    """List the scenes of the open file, without those linked from other files: these cannot be changed."""
+    return [scene for scene in bpy.data.scenes if scene.library is None]
 
 
 def _absolute(path: str, start: str) -> str:
     return os.path.normpath(bpy.path.abspath(path, start=start)) if path.startswith("//") and start else path
+
+
+def _loaded(path: str, start: str) -> str:
+    """Return a path of a .blend in the folder `start` as absolute.
+
+    The add-on's example is where this add-on is: on another machine, or for another Blender, it was elsewhere.
+    """
+    path = _absolute(path, start)
+    return str(EXAMPLE) if path.replace("\\", "/").endswith(_EXAMPLE_END) else path
 
 
 def _relative(path: str, start: str) -> str:
@@ -116,17 +130,15 @@ def _after_saving(file: str, *_) -> None:
 
 
 def _remember_file(file: str) -> None:
-    for scene in bpy.data.scenes:
-        if scene.library is None:
-            scene[SAVED] = file
+    for scene in _own_scenes():
+        scene[SAVED] = file
 
 
 @bpy.app.handlers.persistent
 def _after_loading(*_) -> None:
-    for scene in bpy.data.scenes:
-        if scene.library is None:
-            _borrow(scene)
-    change_paths(lambda path: _absolute(path, os.path.dirname(bpy.data.filepath)))
+    for scene in _own_scenes():
+        _borrow(scene)
+    change_paths(lambda path: _loaded(path, os.path.dirname(bpy.data.filepath)))
 
 
 @bpy.app.handlers.persistent
@@ -136,7 +148,7 @@ def _after_appending(context, *_) -> None:
     if libraries:
         start = os.path.dirname(bpy.path.abspath(libraries[0].filepath))
         for item, key in _custom_properties():
-            item[key] = _absolute(item[key], start)
+            item[key] = _loaded(item[key], start)
 
 
 _HANDLERS = {

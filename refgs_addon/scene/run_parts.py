@@ -11,6 +11,8 @@ INSIDE = "RefGS Inside"  # modifier that draws a mesh in, under the splats
 FOLDER = "refgs_folder"  # custom property of a run's collection: its run folder
 THEIRS = "refgs_theirs"  # custom property of a run's collection: another program made its splats
 DOUBT = "refgs_doubt"  # custom property of a run's collection: the trainer's words on where photos do not tell
+# Run that comes with the add-on. Nothing is written into it: updates of the add-on replace it.
+EXAMPLE = Path(__file__).resolve().parents[1] / "example" / "jar"
 
 
 def parts(collection: bpy.types.Collection) -> dict[str, list[bpy.types.Object]]:

@@ -10,9 +10,9 @@ MANIFEST = Path(__file__).resolve().parents[2] / "blender_manifest.toml"
 
 
 def capture_of(run: Path) -> Path | None:
-    """Return the folder of the capture that a run was trained on, or None."""
+    """Return the folder of the capture that a run was trained on, or None if it is unknown."""
     capture = _table(run, "run").get("capture")
-    return Path(capture) if isinstance(capture, str) else None
+    return Path(capture) if isinstance(capture, str) and capture else None
 
 
 def up_was_chosen(run: Path) -> bool:

@@ -10,8 +10,8 @@ from bpy_extras.io_utils import ExportHelper
 from ..compat import NO_FBX, NO_USD, has_operator
 from ..scene.apply_edits import apply_edits
 from ..scene.deleted_splats import count_deleted
-from ..scene.edit import edits, splats_of
-from ..scene.run_parts import FOLDER, active_run, folder_of, parts
+from ..scene.edit import splats_of
+from ..scene.run_parts import EXAMPLE, FOLDER, active_run, folder_of
 from .operators import ImportRun, ImportSplats, OnRun
 
 
@@ -47,7 +47,10 @@ class Export(OnRun, ExportHelper):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         folder = Path(active_run(context).get(FOLDER, ""))
         self.filter_glob = f"*{self.filename_ext}" if self.filename_ext else ""
-        self.filepath = str(folder.with_name(f"{folder.name} {self.kind}{self.filename_ext}"))
+        beside = folder.parent
+        if folder == EXAMPLE:  # updates of the add-on delete what was written there
+            beside = Path(bpy.data.filepath).parent if bpy.data.filepath else Path.home()
+        self.filepath = str(beside / f"{folder.name} {self.kind}{self.filename_ext}")
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
@@ -80,9 +83,6 @@ class _ExportMesh(Export):
     def problem(cls, run: bpy.types.Collection, folder: Path) -> str:
         if not (folder / "mesh.glb").is_file():
             return "This run has no mesh. The trainer makes one: set it up, and press Apply to New Run"
-        edited = any(edits(splats) for splats in parts(run).get("splats", []))
-        if (edited or cls.filename_ext != ".glb") and not (folder / "textures").is_dir():
-            return "The folder textures is missing beside the run's mesh.glb: copy it there"
         return ""
 
     def work(self, context: bpy.types.Context) -> None:

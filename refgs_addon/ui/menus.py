@@ -1,4 +1,4 @@
-"""Add the menu RefGS to the 3D view's Object menu, so that F3 finds the panels' buttons, and an import to its Add menu."""
+"""Add the menu RefGS to the 3D view's Object menu, so that F3 finds the panels' buttons, and imports to its Add menu."""
 
 import bpy
 
@@ -19,7 +19,8 @@ class RunMenu(bpy.types.Menu):
     bl_label = "Run"
 
     def draw(self, context: bpy.types.Context) -> None:
-        draw_buttons(self.layout, operators.ImportRun, operators.ImportSplats, export_menu.ApplyEdits)
+        draw_buttons(self.layout, operators.ImportRun, operators.ImportExample, operators.ImportSplats)
+        draw_buttons(self.layout, export_menu.ApplyEdits)
         run = active_run(context)
         for part in parts(run) if run else ():
             button = self.layout.operator(operators.ShowPart.bl_idname, text=f"Show {part.title()}")
@@ -82,6 +83,7 @@ def _object_menu(self, context: bpy.types.Context) -> None:
 
 def _add_menu(self, context: bpy.types.Context) -> None:
     self.layout.operator(operators.ImportRun.bl_idname, text="RefGS Run…", icon="POINTCLOUD_DATA")
+    self.layout.operator(operators.ImportExample.bl_idname, text="RefGS Example", icon="POINTCLOUD_DATA")
 
 
 CLASSES = (RunMenu, MaterialsMenu, LightMenu, PreviewMenu, Menu)

@@ -19,7 +19,7 @@ from ..scene.place_run import put_beside
 from ..scene.regions import crop, training_region
 from ..scene.render_eevee import render_preview
 from ..scene.render_process import render_in_background
-from ..scene.run_parts import active_run, show, shown
+from ..scene.run_parts import EXAMPLE, active_run, show, shown
 from ..scene.run_toml import capture_of, newer_release, up_was_chosen
 from ..scene.turntable import add_turntable
 from ..scene.world_light import hdris
@@ -105,20 +105,39 @@ def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, 
         operator.report({"WARNING"}, text)
 
 
-class ImportRun(ReportsErrors, bpy.types.Operator):
-    bl_idname = "refgs.import_run"
-    bl_label = "Import RefGS Run"
-    bl_description = "Import a run folder: splats, mesh, recovered light and cameras"
+class AsksForFolder(ReportsErrors):
+    """Ask for the folder that an operator works on, in Blender's file browser."""
 
     directory: StringProperty(name="Run Folder", subtype="DIR_PATH")
     filter_folder: BoolProperty(default=True, options={"HIDDEN"})
 
-    def invoke(self, context, event):
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
+    @property
+    def chosen_folder(self) -> Path:
+        return Path(bpy.path.abspath(self.directory))
+
+
+class ImportRun(AsksForFolder, bpy.types.Operator):
+    bl_idname = "refgs.import_run"
+    bl_label = "Import RefGS Run"
+    bl_description = "Import a run folder: splats, mesh, recovered light and cameras"
+
     def work(self, context: bpy.types.Context) -> None:
-        import_run_folder(self, context, Path(bpy.path.abspath(self.directory)))
+        import_run_folder(self, context, self.chosen_folder)
+
+
+class ImportExample(ReportsErrors, bpy.types.Operator):
+    bl_idname = "refgs.import_example"
+    bl_label = "Import Example"
+    bl_description = (
+        "Import a small run that comes with the add-on, to try edits and lights: a jar of gold, copper and ceramic"
+    )
+
+    def work(self, context: bpy.types.Context) -> None:
+        import_run_folder(self, context, EXAMPLE)
 
 
 class ImportSplats(ReportsErrors, ImportHelper, bpy.types.Operator):
@@ -146,26 +165,19 @@ class OpenManual(ReportsErrors, bpy.types.Operator):
         bpy.ops.wm.path_open(filepath=str(MANUAL))
 
 
-class FindRun(OnRunFolder, bpy.types.Operator):
+class FindRun(AsksForFolder, OnRunFolder, bpy.types.Operator):
     bl_idname = "refgs.find_run"
     bl_label = "Find Run Folder"
     bl_description = (
         "Choose the folder of this run, if it was moved, renamed or copied: all paths to it follow, and edits stay"
     )
 
-    directory: StringProperty(name="New Folder", subtype="DIR_PATH")
-    filter_folder: BoolProperty(default=True, options={"HIDDEN"})
-
-    def invoke(self, context, event):
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
-
     def work(self, context: bpy.types.Context) -> None:
         from ..scene.find_run import find_run
 
-        old, folder = Path(self.folder), Path(bpy.path.abspath(self.directory))
-        find_run(old, folder)
-        self.report({"INFO"}, f"{old.name} is in {folder}")
+        old = Path(self.folder)
+        find_run(old, self.chosen_folder)
+        self.report({"INFO"}, f"{old.name} is in {self.chosen_folder}")
 
 
 class ShowPart(ReportsErrors, bpy.types.Operator):
@@ -392,6 +404,7 @@ class Dismiss(OnJob, bpy.types.Operator):
 
 CLASSES = (
     ImportRun,
+    ImportExample,
     ImportSplats,
     OpenManual,
     FindRun,

@@ -30,8 +30,11 @@ class RunPanel(Tab, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.operator(operators.ImportRun.bl_idname, icon="IMPORT")
-        for collection in context.scene.collection.children:
-            if found := parts(collection):
+        runs = {collection: parts(collection) for collection in context.scene.collection.children}
+        if not any(runs.values()):
+            layout.operator(operators.ImportExample.bl_idname, icon="MESH_MONKEY")
+        for collection, found in runs.items():
+            if found:
                 self._run(layout.box(), collection, found)
         if not hooks.has_trainer():
             row = layout.row()
@@ -65,30 +68,32 @@ class RunPanel(Tab, bpy.types.Panel):
         if root(collection):
             layout.prop(root(collection), "refgs_longest_side")
         for splats in found.get("splats", []):
-            if splats.hide_viewport or MODIFIER not in splats.modifiers:
-                continue
-            column = layout.column()
-            column.use_property_split, column.use_property_decorate = True, False
-            modifier = splats.modifiers[MODIFIER]
-            for name in ("Display", "Size", "Opacity Cut"):
-                owner, path = compat.modifier_input(modifier, name)
-                column.prop(owner, path, text=name)
-            cropped = bool(compat.get_modifier_input(modifier, "Crop"))
-            button = column.operator(operators.Crop.bl_idname, icon="CUBE", depress=cropped)
-            button.splats, button.on = splats.name, not cropped
-            points, count = points_of(splats), len(splats.data.points)
-            row = layout.row(align=True)
-            row.operator(operators.DeleteSplats.bl_idname, icon="TRASH").splats = splats.name
-            if points is None:
-                layout.label(text=f"{count:,} splats")
-                continue
-            row.operator(operators.RestoreSplats.bl_idname, text="", icon="LOOP_BACK").splats = splats.name
-            if points.mode == "EDIT":
-                layout.label(text="Select points with any tool;")
-                layout.label(text="X deletes them, Tab ends it")
-            else:
-                layout.label(text=f"{len(points.data.vertices):,} of {count:,} splats")
-                layout.operator(ApplyEdits.bl_idname, icon="CHECKMARK")
+            if not splats.hide_viewport and MODIFIER in splats.modifiers:
+                self._splats(layout, splats)
+
+    def _splats(self, layout: bpy.types.UILayout, splats: bpy.types.Object) -> None:
+        column = layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        modifier = splats.modifiers[MODIFIER]
+        for name in ("Display", "Size", "Opacity Cut"):
+            owner, path = compat.modifier_input(modifier, name)
+            column.prop(owner, path, text=name)
+        cropped = bool(compat.get_modifier_input(modifier, "Crop"))
+        button = column.operator(operators.Crop.bl_idname, icon="CUBE", depress=cropped)
+        button.splats, button.on = splats.name, not cropped
+        points, count = points_of(splats), len(splats.data.points)
+        row = layout.row(align=True)
+        row.operator(operators.DeleteSplats.bl_idname, icon="TRASH").splats = splats.name
+        if points is None:
+            layout.label(text=f"{count:,} splats")
+            return
+        row.operator(operators.RestoreSplats.bl_idname, text="", icon="LOOP_BACK").splats = splats.name
+        if points.mode == "EDIT":
+            layout.label(text="Select points with any tool;")
+            layout.label(text="X deletes them, Tab ends it")
+        else:
+            layout.label(text=f"{len(points.data.vertices):,} of {count:,} splats")
+            layout.operator(ApplyEdits.bl_idname, icon="CHECKMARK")
 
 
 class PreviewPanel(Tab, bpy.types.Panel):

@@ -75,6 +75,7 @@ def test_builds_and_validates(tmp_path):
         assert done.returncode == 0, done.stdout + done.stderr
     code = {str(path.relative_to(ROOT)) for path in (ROOT / "refgs_addon").rglob("*.py")}
     code = {name for name in code if not name.startswith(("refgs_addon/trainer/", "refgs_addon/preview"))}
+    code |= {str(path.relative_to(ROOT)) for path in (ROOT / "refgs_addon" / "example").rglob("*") if path.is_file()}
     pages = {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
     assert set(zipfile.ZipFile(archive).namelist()) == code | pages | {
         "__init__.py",

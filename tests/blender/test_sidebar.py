@@ -128,6 +128,12 @@ def test_no_text_of_an_empty_scene_is_cut(addon):
     assert cut_texts() == []
 
 
+def test_the_example_is_offered_while_there_is_no_run(addon):
+    assert "Import Example" in texts(drawn(RunPanel))
+    bpy.ops.refgs.import_example()
+    assert "Import Example" not in texts(drawn(RunPanel)) and cut_texts() == []
+
+
 def test_a_line_says_where_the_trainer_is(addon, monkeypatch):
     assert "The trainer is another extension" not in texts(drawn(RunPanel))
     monkeypatch.setattr(hooks, "mesh_maker", None)  # as without the trainer's extension

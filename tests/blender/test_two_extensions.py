@@ -133,7 +133,15 @@ def test_refgs_alone_is_what_extensions_blender_org_takes(repository):
     archive = next(repository.glob("refgs-*.zip"))
     contents = zipfile.ZipFile(archive)
     assert archive.stat().st_size < 1e6
-    assert {Path(name).suffix for name in contents.namelist()} == {".py", ".md", ".toml", ""}
+    example = {name for name in contents.namelist() if name.startswith("refgs_addon/example/jar/")}
+    assert {Path(name).name for name in example} >= {
+        "splats.ply",
+        "mesh.glb",
+        "environment.exr",
+        "cameras.json",
+        "run.toml",
+    }
+    assert {Path(name).suffix for name in {*contents.namelist()} - example} == {".py", ".md", ".toml", ""}
     reaching, paths = {}, []
     for name in contents.namelist():
         for node in ast.walk(ast.parse(contents.read(name))) if name.endswith(".py") else ():
@@ -199,6 +207,7 @@ def test_refgs_works_alone(installed):
 on(FIRST)
 bpy.ops.wm.read_homefile(use_empty=True)
 ops, out = bpy.ops.refgs, HERE + "/out "
+assert ops.import_example() == {"FINISHED"} and "RefGS jar" in bpy.data.collections
 assert ops.import_run(directory=HERE + "/still/") == {"FINISHED"}
 ops.add_edit(where="Everywhere", material="Gold")
 ops.relight(filepath=HERE + "/still/environment.exr", rotation=1.0, strength=2.0)

@@ -142,6 +142,16 @@ def test_first_clicks(tmp_path, python):
 
 
 @pytest.mark.window
+@pytest.mark.timeout(1200)
+def test_one_click_imports_the_example(tmp_path):
+    report = in_window("example.py", tmp_path, simulated=False)
+    if not report["xdotool"]:
+        pytest.skip("no xdotool, which clicks as an artist does")
+    assert report["active"] == "jar mesh" and report["shading"] == "MATERIAL"
+    assert golden(tmp_path / "example.png") > golden(tmp_path / "empty.png") + 0.02
+
+
+@pytest.mark.window
 def test_an_artist_trains(tmp_path, ball_capture):
     """Check a whole session in a Blender window with the real trainer.
 

@@ -15,6 +15,7 @@ from ...json_file import read_json
 from ...preferences import log_file
 from ...scene.apply_edits import remember
 from ...scene.capture_cameras import cameras_of, show_cameras
+from ...scene.run_parts import EXAMPLE
 from ...scene.run_toml import capture_of
 from .. import commands
 from ..preferences import capture_folder, hints_file, mask_model, python
@@ -158,6 +159,10 @@ def plan_hint(scene: bpy.types.Scene, collection: bpy.types.Collection) -> HintP
     from ...scene.export_run import run_folder
 
     folder = run_folder(collection)
+    if folder == EXAMPLE:
+        raise InputError(
+            "the example came without its photos: train on a capture of yours, and say there what is metal"
+        )
     if not any((folder / "checkpoints").glob("*.toml")):
         raise InputError(f"{folder.name} has no checkpoint to train from: import the run as it was trained")
     capture = _trained_capture(scene, folder)
