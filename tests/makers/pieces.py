@@ -44,7 +44,9 @@ def reckoned(points, normals, metal, metallic, by_object=False):
     start["roughness"] = torch.where(points[:, 2] > 1, -3.0, 0.0)
     seen = seen_as(points, normals)
     fitted = torch.full((count, 3), 0.8), torch.full((count,), 0.2), torch.full((count,), by_object)
-    graph = same_material.laplacian(points, seen, neighbours(points, NEIGHBOURS))
+    near = neighbours(points, NEIGHBOURS)
+    graph = same_material.laplacian(points, seen, near)
     known = torch.ones(count, dtype=torch.bool)
     sums = torch.full((count, 3), 0.8), torch.ones(count, 3), torch.zeros(count, 1, dtype=torch.bool)
-    return reckoning.Reckoned(metal, activate(start), seen, seen.pixels, *fitted, *sums, graph, {}, known)
+    changes = reckoning.mean_and_changes(seen, near)[1]
+    return reckoning.Reckoned(metal, activate(start), seen, seen.pixels, *fitted, *sums, changes, graph, {}, known)

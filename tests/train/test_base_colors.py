@@ -7,12 +7,13 @@ from refgs.model import cubemap
 from refgs.model.surfels import raw_metallic
 from refgs.render.mirrored_light import SIDE
 from refgs.train.keep import snapshot
-from refgs.train.material import base_colors, metals
+from refgs.train.material import base_colors, metals, reckoning
+from refgs.train.material.observe import neighbours
 from tests.makers.pieces import ball_on_board, reckoned
 from tests.makers.training import do, put
 from tests.makers.training import trainer as small
 
-ROW = "keep base colours"
+LEVEL, DRAW = "level base colours", "draw metals' base colours"
 
 
 def ball(by_object):
@@ -62,6 +63,33 @@ def test_mirrors_tell_the_light_that_they_face():
     assert not told[above < -0.1].any() and float(told[above > 0.1].float().mean()) > 0.85
 
 
+def highlights(found, light, own):
+    """Return `found` as 12 photos show it: of base colour `own` (N, 3), with highlights, in a light of colours `light` (N, 3)."""
+    points = found.surfels.positions
+    gloss = 0.1 * torch.rand(len(points) // 50 + 1, 12, 1, generator=torch.Generator().manual_seed(0))
+    radiance = light[:, None] * (0.3 * own[:, None] + gloss[torch.arange(len(points)) // 50])
+    seen = found.seen._replace(radiance=radiance, weight=torch.full(radiance.shape[:2], 9.0))
+    return found._replace(changes=reckoning.mean_and_changes(seen, neighbours(points, 16))[1])
+
+
+def test_highlights_of_paint_tell_the_hue_of_the_light():
+    """Check red paint in a bluish light, of which metals tell nothing."""
+    found, metal = ball(lambda i: i >= 0)
+    light, own = torch.tensor([0.85, 1.0, 1.15]), torch.tensor([0.8, 0.3, 0.1])
+    expected = light.log() - light.log().mean()
+    found = highlights(found, torch.where(metal[:, None], light.flip(0), light), own.expand(len(metal), 3))
+    assert torch.allclose(base_colors.told_hue(found, ~metal), expected, atol=0.01)
+    assert not base_colors.told_hue(found, metal & False).any()
+
+
+def test_paint_whose_highlights_have_many_colours_tells_no_hue():
+    found, metal = ball(lambda i: i >= 0)
+    across = found.surfels.positions[:, :1]
+    light = (torch.tensor([0.3, 0.1, -0.4]) * (1 + 2 * across)).exp()
+    hue = base_colors.told_hue(highlights(found, light, torch.ones(len(metal), 3)), ~metal)
+    assert float(hue.abs().max()) < 0.1 and float(hue.sum()) == pytest.approx(0, abs=1e-6)
+
+
 def test_metals_that_mirror_no_object_are_left_alone():
     for few in (lambda i: i < 0, lambda i: i % 100 == 0):
         found, metal = ball(few)
@@ -75,7 +103,7 @@ def test_metals_are_drawn_to_what_they_show(large_ball, tmp_path):
     unknown = metal & (torch.arange(count) % 2 > 0)
     state.learned["shown_color"].data.copy_(torch.tensor([0.9, 0.6, 0.3, 1.0]) * ~unknown[:, None])
     for _ in range(40):
-        do(state, ROW, 0.3, done=120)
+        do(state, DRAW, 0.3, done=120)
     now = state.surfels().albedo.detach()
     assert torch.allclose(now[metal & ~unknown], torch.tensor([0.9, 0.6, 0.3]), atol=1e-3)
     assert torch.allclose(now[unknown], shade[:count][unknown], atol=1e-5), "photos tell nothing of these"
@@ -93,7 +121,7 @@ def test_later_metals_keep_their_level_and_learn_patterns(large_ball, tmp_path):
     state.learned["shown_color"].data.copy_(torch.tensor([0.6, 0.6, 0.6, 1.0]).expand(len(metal), 4))
     light = state.learned["environment"].detach().clone()
     for _ in range(10):
-        do(state, "level metals' base colours", 0.8, done=320)
+        do(state, LEVEL, 0.8, done=320)
     now = state.surfels().albedo.detach()
     ratio = now[metal] / pattern[metal]
     assert torch.allclose(ratio, ratio.mean().expand_as(ratio), rtol=1e-3) and float(now[metal].log().mean().exp()) == (
@@ -128,7 +156,7 @@ def test_white_paint_under_dim_lamps_is_darker_under_brighter_lamps(large_ball, 
 
     before, colour = power(), state.surfels().albedo.detach()[~metal].mean(dim=0)
     for _ in range(60):
-        do(state, ROW, 0.3, done=120)
+        do(state, LEVEL, 0.3, done=120)
     now = state.surfels().albedo.detach()[~metal].mean(dim=0)
     assert torch.allclose(now * power(), colour * before, rtol=1e-3)
     assert torch.allclose(light.detach()[~lamps].exp(), torch.tensor(0.1))
@@ -139,7 +167,7 @@ def test_white_paint_under_dim_lamps_is_darker_under_brighter_lamps(large_ball, 
 def test_a_light_without_lamps_is_kept(large_ball, tmp_path):
     state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.9, 0.8, 0.7]))
     light = state.learned["environment"].detach().fill_(-1.0).clone()
-    do(state, ROW, 0.3, done=120)
+    do(state, LEVEL, 0.3, done=120)
     assert torch.equal(state.learned["environment"], light)
     assert torch.allclose(state.surfels().albedo[~metal], torch.tensor([0.9, 0.8, 0.7]), atol=1e-5)
 
@@ -150,8 +178,8 @@ def test_base_colours_stay_below_one(large_ball, tmp_path):
     put(made, albedo=torch.tensor([20.0, 0.0, -40.0]), metallic=raw_metallic(0.98), told=True)
     metal = torch.ones(state.learned.count, dtype=torch.bool)
     state.learned["shown_color"].data.fill_(1.0)
-    base_colors.level(state, metal)
-    base_colors.keep(state, metal, ~metal)
+    base_colors.level(state, metal, ~metal, torch.zeros(3))
+    base_colors.draw(state, metal)
     assert bool(state.learned["albedo"].isfinite().all()) and float(state.surfels().albedo.detach().max()) <= 0.981
 
 

@@ -8,13 +8,14 @@ than few lamps, a thousand dark texels became a little brighter. Six steps preve
 - Base colours start at what photos show (`start`), not at grey: else the light takes the object's colour.
 - A metal's base colour is drawn to what it shows of the object, divided by what photos show there (`told`). That needs no light. It is one
   colour for a piece (`same_material`).
-- Metals keep their mean base colour (`level`), to the end.
+- Metals keep their mean base colour (`level`).
 - What metals mirror of the light is told by them (`told_light`): what lights paint no longer changes it. Only lamps do more for paint.
 - The base colour of paint is averaged over neighbours (`average`), so that the light, not the paint, learns shades.
-- Lamps have the colour, and together with paint the brightness, that experience tells (`_balance`).
+- Lamps have the colour that highlights of paint tell (`told_hue`), and together with paint the brightness that experience tells
+  (`_balance`).
 
-All but the first are only done where photos tell the base colour of a metal: elsewhere the light is not known. Metals are drawn, paint is
-averaged and lamps are balanced until 60 % of the training. Later, base colours are free: photos add patterns and stains.
+All but the first are only done where photos tell the base colour of a metal: elsewhere the light is not known. Metals are drawn and paint
+is averaged until 60 % of the training. Later, only their means are kept: photos add patterns and stains.
 """
 
 import math
@@ -43,6 +44,7 @@ LEAST_KNOWN = 0.02  # less spreads from afar
 LEAST_PART = 0.05  # fraction of the metals' pixels from which on what they mirror of the object tells
 AVERAGED = 64  # neighbours
 PAINT = 0.35  # the most that all paint's brightest channel has in the mean; the median of 34 rendered scenes is 0.34
+HUES = 0.13  # standard deviation of the logarithms of a light's hue: Blender's eight HDRIs have this
 LEAST_MIRRORED = 2.0  # pixels that must mirror a texel of the coarse cubemap, so that they tell its radiance
 STEP, MOST_STEP = 0.1, 0.05  # part of the way to balance, each time, and the largest step: logarithms
 
@@ -109,22 +111,52 @@ def told_light(found: Reckoned, metals: Tensor) -> Tensor:
     return pixels > LEAST_MIRRORED
 
 
+def told_hue(found: Reckoned, paint: Tensor) -> Tensor:
+    """Tell the hue of the light from highlights of `paint` (N,): natural logarithms (3,), whose sum is 0.
+
+    A dielectric's highlight has the light's colour (Shafer 1985), so the radiance of paint changes from photo to photo along that colour.
+    The more a surfel changes, the more it counts. The wider the surfels differ, the less their median is trusted against grey.
+    """
+    values, vectors = torch.linalg.eigh(found.changes)
+    axis = vectors[..., 2] * vectors[..., 2].sum(dim=1, keepdim=True).sign()
+    weight = found.pixels * paint * found.known * values[:, 2] * (axis > 0).all(dim=1)
+    if weight.sum() <= 0:
+        return torch.zeros(3)
+    logs = axis.clamp_min(1e-3).log()
+    logs = logs - logs.mean(dim=1, keepdim=True)
+    hue = _median(logs, weight)
+    spread = 1.4826 * _median((logs - hue).abs(), weight)  # standard deviation, if the distribution is normal
+    hue = hue * HUES**2 / (HUES**2 + spread.square().mean())
+    return hue - hue.mean()
+
+
+def _median(values: Tensor, weight: Tensor) -> Tensor:
+    """Return the weighted median of each column of `values` (N, C): (C,)."""
+    order = values.argsort(dim=0)
+    sums = weight[order].cumsum(dim=0)
+    middle = (sums < 0.5 * sums[-1]).sum(dim=0, keepdim=True)
+    return values.gather(0, order.gather(0, middle))[0]
+
+
 @torch.no_grad()
-def level(state: State, metals: Tensor) -> None:
-    """Keep the mean base colour of `metals` (N,) at what photos tell. Differences between them can learn."""
+def draw(state: State, metals: Tensor) -> None:
+    """Draw base colours of `metals` (N,) to what photos tell."""
+    raw = state.learned["albedo"]
+    logs, wrong, weight = _wrong(state, metals)
+    raw.copy_(torch.where(metals[:, None], torch.logit(plausible((logs + DRAWN * weight * wrong).exp())), raw))
+
+
+@torch.no_grad()
+def level(state: State, metals: Tensor, paint: Tensor, hue: Tensor) -> None:
+    """Keep the mean base colour of `metals` (N,) at what photos tell, and balance lamps with `paint` (N,) (see `_balance`).
+
+    Differences between base colours can learn.
+    """
     raw = state.learned["albedo"]
     logs, wrong, weight = _wrong(state, metals)
     mean = (weight * wrong).sum(dim=0) / weight.sum().clamp_min(1e-6)
-    raw.copy_(torch.where(weight > 0, torch.logit(plausible((logs + mean).exp())), raw))
-
-
-@torch.no_grad()
-def keep(state: State, metals: Tensor, paint: Tensor) -> None:
-    """Draw base colours of `metals` (N,) to what photos tell, and balance lamps with `paint` (N,)."""
-    raw = state.learned["albedo"]
-    logs, wrong, weight = _wrong(state, metals)
-    logs = logs + DRAWN * weight * wrong + paint[:, None] * _balance(state, logs, paint)
-    raw.copy_(torch.where((metals | paint)[:, None], torch.logit(plausible(logs.exp())), raw))
+    logs = logs + torch.where(weight > 0, mean, 0) + paint[:, None] * _balance(state, logs, paint, hue)
+    raw.copy_(torch.where((weight > 0) | paint[:, None], torch.logit(plausible(logs.exp())), raw))
 
 
 def _wrong(state: State, metals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -144,11 +176,11 @@ def average(state: State, paint: Tensor) -> None:
     raw[paint] = torch.logit(plausible(mean_over(near, raw.sigmoid(), weight)))
 
 
-def _balance(state: State, logs: Tensor, paint: Tensor) -> Tensor:
+def _balance(state: State, logs: Tensor, paint: Tensor, hue: Tensor) -> Tensor:
     """Change lamps' radiance a little, and return the change (3,) of paint's base colours that makes up for it, as a logarithm.
 
-    `logs` (N, 3) are logarithms of base colours. Photos are balanced to white, so the light as a whole is drawn to grey. The smaller the
-    part of lamps is, the less changes.
+    `logs` (N, 3) are logarithms of base colours. The light as a whole is drawn to the `hue` (3,), logarithms. The smaller the part of
+    lamps is, the less changes.
     """
     radiance = state.method.light.radiance(state.learned["environment"])
     area = cubemap.texel_solid_angles(math.isqrt(len(radiance) // 6))
@@ -158,7 +190,7 @@ def _balance(state: State, logs: Tensor, paint: Tensor) -> Tensor:
     surfels = state.surfels()
     weight = paint * surfels.opacities * surfels.scales.prod(dim=1)
     mean = (logs.amax(dim=1).exp() * weight).sum() / weight.sum().clamp_min(1e-30)
-    wanted = (PAINT / mean.clamp_min(DARKEST)).log().clamp_max(0) + whole.log() - whole.log().mean()
+    wanted = (PAINT / mean.clamp_min(DARKEST)).log().clamp_max(0) + whole.log() - whole.log().mean() - hue
     step = part * (STEP * wanted).clamp(-MOST_STEP, MOST_STEP)
     brighter = 1 + ((-step).exp() - 1) / part.clamp_min(1e-6)
     raw = state.learned["environment"]

@@ -32,14 +32,16 @@ class Metals(Part):
 
     Of each surfel, remember whether hints hold its kind (`held`), whether photos are sure of it (`told`), and the base colour that photos
     tell of it, if it is metal (`shown_color`, see `base_colors.told`). Checkpoints also keep `state.told_light`. It is None unless photos
-    tell base colours of some metals that are sure; without masks, they never do.
+    tell base colours of some metals that are sure; without masks, they never do. `hue` (3,) is the light's (`base_colors.told_hue`).
     """
 
-    name, saved = "metals", ("found",)
+    name, saved = "metals", ("found", "hue")
     found = False
+    hue: torch.Tensor
 
     def start(self, state: State) -> None:
         self.found, state.told_light = False, None
+        self.hue = torch.zeros(3, device=state.device)
         if "metallic" in state.learned:
             state.learned.learn("shown_color", torch.zeros(state.learned.count, 4, device=state.device))
             for name in ("held", "told"):
@@ -47,7 +49,7 @@ class Metals(Part):
                 state.learned.learn(name, none)
 
     def restore(self, state: State, facts: Mapping[str, Any]) -> None:
-        super().restore(state, facts)
+        super().restore(state, {"hue": self.hue, **facts})
         state.told_light = facts.get("told_light")
 
     def facts(self, state: State) -> dict[str, Fact]:
@@ -92,6 +94,7 @@ def _judge(state: State, first: bool = False) -> None:
     shown = state.learned["shown_color"]
     sure = _sure_kinds(state)[0].cpu()
     shown.copy_(base_colors.told(found, sure))
+    state.part(Metals).hue = base_colors.told_hue(found, _sure_kinds(state)[1].cpu()).to(state.device)
     colored = state.from_hull and bool(shown.any())
     state.told_light = base_colors.told_light(found, sure).to(state.device) if colored else None
     if raised.any():
@@ -164,16 +167,16 @@ def hold_as(state: State, kinds: torch.Tensor) -> None:
     state.part(Metals).found = True
 
 
-def keep_base_colors(state: State, step: Step) -> None:
-    """Keep base colours at what photos and experience tell, see `base_colors`."""
+def draw_metals(state: State, step: Step) -> None:
+    """Draw base colours of metals to what photos tell."""
     if _base_colors_kept(state):
-        base_colors.keep(state, *_sure_kinds(state))
+        base_colors.draw(state, _sure_kinds(state)[0])
 
 
-def level_metals(state: State, step: Step) -> None:
-    """Keep the mean base colour of metals at what photos tell."""
+def level_base_colors(state: State, step: Step) -> None:
+    """Keep mean base colours, and lamps, at what photos and experience tell, see `base_colors`."""
     if _base_colors_kept(state):
-        base_colors.level(state, _sure_kinds(state)[0])
+        base_colors.level(state, *_sure_kinds(state), state.part(Metals).hue)
 
 
 def average_paint(state: State, step: Step) -> None:

@@ -60,6 +60,7 @@ class Reckoned(NamedTuple):
     - `by_object` (N,): whether the reflectance follows from what photos show of the object, so that it does not depend on the light
     - `reflected`, `white` (N, 3): see `mirrored.Fit`, by the photos in which surfels mirror the object
     - `met` (N, V): whether a surfel mirrors the object in a photo
+    - `changes` (N, 3, 3): the covariance of the radiance of a surfel and its neighbours over the photos, relative to its mean
     - `graph`: the Laplacian of neighbouring surfels (`same_material.laplacian`)
     - `terms`: see WEIGHTS, (N,) each, before they are spread
     - `known` (N,): whether photos show the surfel and its neighbours well enough for terms
@@ -75,6 +76,7 @@ class Reckoned(NamedTuple):
     reflected: Tensor
     white: Tensor
     met: Tensor
+    changes: Tensor
     graph: sparse.csr_matrix
     terms: dict[str, Tensor]
     known: Tensor
@@ -95,7 +97,8 @@ def reckon(state: State) -> Reckoned:
     near = neighbours(surfels.positions, NEIGHBOURS)
     fits = mirrored.fit_both(seen, rays, near)
     graph = same_material.laplacian(surfels.positions, seen, near)
-    values = terms(seen, fits, near) | terms_of_changes(state, near)
+    shown, changes = mean_and_changes(seen, near)
+    values = terms(seen, fits, near, shown, changes) | terms_of_changes(state, near)
     every, of_object = fits.everywhere, fits.of_object
     known = (seen.pixels > same_material.FRINGE) & (every.pixels > ENOUGH_PIXELS)
     metal = same_material.spread(graph, log_odds(values), known.float()).sigmoid()
@@ -105,7 +108,9 @@ def reckon(state: State) -> Reckoned:
     roughness = torch.where(by_object, of_object.roughness, every.roughness)
     pixels = seen.pixels * state.wanted().cpu()
     sums = of_object.reflected, of_object.white, fits.met
-    return Reckoned(metal, surfels, seen, pixels, reflectance, roughness, by_object, *sums, graph, values, known)
+    return Reckoned(
+        metal, surfels, seen, pixels, reflectance, roughness, by_object, *sums, changes, graph, values, known
+    )
 
 
 def log_odds(values: dict[str, Tensor]) -> Tensor:
@@ -113,8 +118,10 @@ def log_odds(values: dict[str, Tensor]) -> Tensor:
     return BIAS + torch.stack([weight * values[name] for name, weight in WEIGHTS.items()]).sum(dim=0)
 
 
-def terms(seen: Seen, fits: mirrored.Mirrored, near: Tensor) -> dict[str, Tensor]:
-    """Compute the terms (N,) that compare what each surfel shows with what it mirrors. `near` (N, K) are neighbours to average over.
+def terms(seen: Seen, fits: mirrored.Mirrored, near: Tensor, shown: Tensor, changes: Tensor) -> dict[str, Tensor]:
+    """Compute the terms (N,) that compare what each surfel shows with what it mirrors.
+
+    `near` (N, K) are neighbours to average over; `shown` and `changes` is what they show (`mean_and_changes`).
 
     - fall: how far the darkest tenth of the photos is below the median, as a logarithm. A metal has no diffuse radiance, so it may be far
       darker than its median.
@@ -125,7 +132,7 @@ def terms(seen: Seen, fits: mirrored.Mirrored, near: Tensor) -> dict[str, Tensor
     """
     every, of_object = fits.everywhere, fits.of_object
     met = of_object.pixels > ENOUGH_PIXELS
-    tint, grey = _tint(seen, near)
+    tint, grey = _tint(shown, changes)
     return {
         "fall": _fall(seen.radiance.mean(dim=2), seen, near),
         "light's fall": _fall(fits.radiance, seen, near),
@@ -157,11 +164,10 @@ def _log_ratio(median: Tensor, low: Tensor) -> Tensor:
     return (median.clamp_min(DARKEST) / low.clamp_min(DARKEST)).log().clamp(0, MOST_FALL)
 
 
-def _tint(seen: Seen, near: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute how much the radiance of surfels and their neighbours changes along their own colour, and which have none: (N,) each.
+def mean_and_changes(seen: Seen, near: Tensor) -> tuple[Tensor, Tensor]:
+    """Average what surfels and their neighbours show over the photos: the mean radiance (N, 3), and its covariance (N, 3, 3).
 
-    A dielectric's reflection has the light's colour, which is grey on average. The direction of change is the first principal axis of the
-    radiance over the photos.
+    The covariance is that of the radiance divided by the brightness of its mean.
     """
     pixels = pooled(seen.weight, near)
     shown = pooled(seen.radiance * seen.weight[..., None], near)
@@ -170,7 +176,15 @@ def _tint(seen: Seen, near: Tensor) -> tuple[Tensor, Tensor]:
     shown = shown / pixels.clamp_min(1e-6)[..., None] * known
     mean = shown.sum(dim=1) / count
     change = (shown - mean[:, None]) * known / mean.mean(dim=1).clamp_min(1e-2)[:, None, None]
-    covariance = change.transpose(1, 2) @ change / count[:, None]
+    return mean, change.transpose(1, 2) @ change / count[:, None]
+
+
+def _tint(mean: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute how much the radiance of surfels and their neighbours changes along their own colour, and which have none: (N,) each.
+
+    A dielectric's reflection has the light's colour, which is grey on average. The direction of change is the first principal axis of the
+    radiance over the photos. See `mean_and_changes` for `mean` (N, 3) and `covariance` (N, 3, 3).
+    """
     axis = torch.linalg.eigh(covariance).eigenvectors[:, :, 2]
     axis = axis * torch.sign(axis.sum(dim=1, keepdim=True))
     axis = axis / axis.sum(dim=1, keepdim=True).clamp_min(0.2)
