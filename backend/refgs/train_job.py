@@ -33,7 +33,7 @@ from refgs.run_folder import (
     update_metrics,
 )
 from refgs.settings import Settings
-from refgs.train.plan import Plan
+from refgs.train.plan import TRADES, Plan
 
 if TYPE_CHECKING:
     from refgs.capture import Capture, CaptureFiles
@@ -343,7 +343,8 @@ def _finish(trainer: "Trainer") -> float | None:
         trim()
         quality = held_out_psnr(state, most=len(state.test))
         trim()
-        trades = ambiguities(state)
+        what = "what light and materials can make up for"
+        trades = ambiguities(state) if state.plan.pays_at_end(what, TRADES) else {}
         update_metrics(out, _most_memory() | {"ambiguities": trades, "total_seconds": state.plan.spent})
         for facts in trades.values():
             if "what" in facts:

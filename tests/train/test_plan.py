@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from refgs.train import plan, timeline
-from refgs.train.plan import END, END_A_VIEW, Plan, iterations_time
+from refgs.train.plan import Plan, iterations_time
 
 VIEWS = 40
 
@@ -45,9 +45,9 @@ def _train(
             made.wait(paused)
         clock.now += pace(iteration)
         iteration += 1
-        if timeline.PLAN.due(SimpleNamespace(plan=made), SimpleNamespace(done=iteration)):
+        if timeline.PLAN.due(SimpleNamespace(plan=made, total=total), SimpleNamespace(done=iteration)):
             total = made.total(iteration, VIEWS) or total
-    clock.now += pace(iteration) * (END_A_VIEW * VIEWS + END)
+    clock.now += pace(iteration) * made.end(VIEWS, pace(iteration))
     return iteration, clock.now - begun - paused
 
 
@@ -63,9 +63,10 @@ def test_it_ends_on_time_whatever_an_iteration_takes(clock, pace, minutes):
 
 
 def test_where_iterations_grow_slower_as_expected_their_number_is_known_at_once(clock):
-    """Check that the planned number of iterations is right to 2 % from the start, if iterations slow down as predicted.
+    """Check that the planned number of iterations is right to 4 % from the start, if iterations slow down as predicted.
 
-    Learning rates depend on this number, so it must not change during the training.
+    Learning rates depend on this number, so it must hardly change during the training. It changes when an optional part of the end no
+    longer pays.
     """
     made, asked = Plan(5), []
     whole = made.total
@@ -80,7 +81,7 @@ def test_where_iterations_grow_slower_as_expected_their_number_is_known_at_once(
     steps = np.diff([iterations_time(2.0, min(k / count, 1)) * count for k in range(int(count) + 2)])
     done, _ = _train(clock, made, lambda i: 0.05 * steps[min(i, len(steps) - 1)], growth=2.0)
     known = [value for value in asked if value]
-    assert len(known) > 50 and min(known) > 0.98 * done and max(known) < 1.02 * done
+    assert len(known) > 50 and min(known) > 0.96 * done and max(known) < 1.04 * done
 
 
 def test_a_pause_is_not_counted(clock):

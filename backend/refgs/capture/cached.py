@@ -8,12 +8,14 @@ import hashlib
 import mmap
 import shutil
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
 
-from refgs import __version__
+from refgs import CORES, __version__
 from refgs.camera import Camera
 from refgs.capture.images import LoadedView, load_view
 from refgs.capture.reduce import reduced
@@ -31,7 +33,8 @@ def load_views(views: list[View], max_side: int, folder: Path) -> list[LoadedVie
     """
     cameras = [view.camera.fitted(max_side) for view in views]
     if sum(4 * camera.width * camera.height for camera in cameras) <= LARGE:
-        return [load_view(view, max_side) for view in views]
+        with ThreadPoolExecutor(CORES) as threads:  # decoders and NumPy work outside of Python's lock
+            return list(threads.map(load_view, views, repeat(max_side)))
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
     names = [_name(view, max_side) for view in views]

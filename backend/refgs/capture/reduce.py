@@ -12,7 +12,7 @@ from refgs.camera import Camera
 from refgs.capture.lens import Lens
 from refgs.color import srgb_decode, srgb_encode
 
-STRIP = 1 << 18  # pixels of the photo in a strip, about
+STRIP = 1 << 16  # pixels of the photo in a strip, about
 
 
 def reduced(
@@ -41,9 +41,9 @@ def reduced(
             linear = (weights @ linear.reshape(len(linear), -1)).reshape(len(weights), fitted.width, -1)
         if opaque is not None:
             weight = linear[..., 3]
-            linear = linear[..., :3] / np.maximum(weight, 1e-6)[..., None]
             opaque[rows] = np.rint(np.clip(weight, 0, 1) * 255)
-            linear[opaque[rows] == 0] = 0
+            divisor = np.where(opaque[rows] == 0, np.float32(np.inf), np.maximum(weight, 1e-6))
+            linear = np.stack([linear[..., channel] / divisor for channel in range(3)], axis=-1)
         codes[rows] = encode(linear, white)
     return codes, opaque
 
@@ -80,7 +80,8 @@ def _linear(image: np.ndarray, alpha: np.ndarray | None, white: int, rows: slice
         return linear
     weight = alpha[rows].astype(np.float32) / 255
     premultiplied = np.empty((*weight.shape, 4), np.float32)
-    np.multiply(linear, weight[..., None], out=premultiplied[..., :3])
+    for channel in range(3):  # several times as fast as all at once
+        np.multiply(linear[..., channel], weight, out=premultiplied[..., channel])
     premultiplied[..., 3] = weight
     return premultiplied
 

@@ -106,7 +106,12 @@ def orbit_order(sides: tuple[int, ...]) -> Tensor:
 
 def in_texel_order(levels: Tensor, sides: tuple[int, ...]) -> Tensor:
     """Reorder stacked cubemaps (Σ 6·side², C) from orbit order to face, row, column."""
-    return levels[orbit_order(sides).argsort()]
+    return levels[_texel_order(sides)]
+
+
+@lru_cache
+def _texel_order(sides: tuple[int, ...]) -> Tensor:
+    return orbit_order(sides).argsort()
 
 
 @lru_cache(maxsize=1)

@@ -16,6 +16,7 @@ from refgs.render.volume import discs
 from refgs.settings import RenderSettings
 
 SIDE = 16  # texels along a side of the coarse cubemap in which mirrored directions are counted
+PIXELS = 128  # pixels of a picture's longer side, at most: more count the same directions
 
 
 def mirrored_light(
@@ -31,7 +32,7 @@ def mirrored_light(
     """
     pixels = torch.zeros(6 * SIDE * SIDE)
     settings = settings.model_copy(update={"reflection": "microfacet"})  # treat matte surfaces as reflective here
-    for camera in cameras:
+    for camera in (camera.fitted(PIXELS) for camera in cameras):
         lit = stack(channels(surfels, camera, settings, indirect=True))
         features, _, alpha = rasterize(*discs(surfels, camera), lit, camera, near=near)
         turn = torch.from_numpy(light.turn(camera)).float().T

@@ -1,7 +1,9 @@
 """Choose the settings of a training that must end within a given time. They range from the preset `quick` to beyond `standard`."""
 
 import math
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
 from refgs.capture import Capture
 from refgs.effective import Effective
@@ -9,11 +11,19 @@ from refgs.events import Report
 from refgs.settings import RATES, Settings, validate
 from refgs.train.decide.object_size import object_size, surfel_budget
 from refgs.train.learn import coarse
-from refgs.train.plan import BY_PIXELS, END, END_A_VIEW, FULL, OTHERS, Plan, growth, iterations_time
+from refgs.train.learn.poses import Poses
+from refgs.train.plan import FULL, OTHERS, PART, STARTS, Plan, by_pixels, growth, iterations_time
+from refgs.train.timeline import DIVIDE_COST, MESH_COST
 from refgs.train.trainer import Trainer
 
 WARM, REHEARSED = 5, 25  # iterations between which the pace is measured
-SCHEDULE = ("train", "light_first"), ("densify", "every"), ("indirect", "every")  # scaled with the iterations
+REHEARSAL = 0.03  # of the time given, after which fewer iterations are enough
+# Settings that are scaled with the iterations, and the fewest iterations to which they are reduced.
+SCHEDULE = (
+    ("train", "light_first", 1),
+    ("densify", "every", DIVIDE_COST / PART),
+    ("indirect", "every", MESH_COST / PART),
+)
 FASTEST = 2.0  # largest factor on a preset's learning rates
 RICHER_STEPS, RICHEST = 64, 2.0  # number of steps from `quick` (0) to the richest settings; `standard` is at 1
 
@@ -23,22 +33,31 @@ def fitting(
 ) -> Trainer:
     """Make a trainer whose settings let the training end within `plan.minutes`.
 
-    First, run a few iterations with the preset `quick` to measure how long an iteration takes. Then try settings from `quick` to beyond
-    `standard` (see `between`), and choose the most detailed ones whose iterations all fit. If none fit, choose `quick`. Finally, set the
-    number of iterations to as many as fit.
+    First, run a few iterations with the preset `quick` to measure how long an iteration takes. If there is little time, they start with
+    less detail: the time since the command started tells how fast the machine is now. Then try settings from `quick` to beyond
+    `standard` (see `between`), and choose the most detailed ones whose iterations all fit. If none fit, choose `quick`. Finally, set
+    the number of iterations to as many as fit.
 
     If `quick` is chosen, the training continues after the measured iterations. Otherwise it starts anew. `effective` holds the settings of
     the preset `quick`, and `standard` those of the preset `standard`. Both include the user's changes.
     """
-    quick, begun, said = effective.settings, plan.spent, []
+    why, begun, said, detail = (
+        f"{plan.minutes:g} minutes were given",
+        plan.spent,
+        [],
+        plan.lower_detail(STARTS * plan.given / plan.spent),
+    )
+    effective = effective.moved_to(_with_detail(effective.settings, detail), "plan", why)
+    quick = effective.settings
     trainer = Trainer(capture, effective, folder, lambda *event: said.append(event), plan, device)
     started = plan.spent
     marks = []
-    for _ in range(REHEARSED):
+    while len(marks) <= WARM or (len(marks) < REHEARSED and plan.spent - marks[WARM - 1] < REHEARSAL * plan.given):
         float(trainer.iterate()["loss"])  # reading the loss waits for the graphics card
         marks.append(plan.spent)
     cost = trainer.state.part(coarse.Coarse).stages[0].cost
-    pace = (marks[-1] - marks[WARM - 1]) / (REHEARSED - WARM) / cost  # seconds of an iteration on full photos
+    # Seconds of an iteration on full photos. The median, because some of the first iterations wait for what is loaded only once.
+    pace = median(after - before for before, after in pairwise(marks[WARM - 1 :])) / cost
     views, first = len(capture.train_views) + len(capture.test_views), trainer.state.learned.count
     pixels, size = _pixels(capture, quick), object_size(trainer.state)
 
@@ -47,15 +66,15 @@ def fitting(
         larger = _pixels(capture, settings) / pixels
         # Fewer points may be known to start from than the settings ask for.
         start = settings.surfels.start if first == quick.surfels.start else first
-        one = pace * (OTHERS + start) / (OTHERS + first) * larger**BY_PIXELS
-        left = 60 * (plan.minutes or 0.0) - plan.spent
+        one = pace * (OTHERS + start) / (OTHERS + first) * by_pixels(size.span**2 or pixels / views, larger)
+        left = plan.given - plan.spent
         if settings is not quick:
             left -= (started - begun) * larger  # richer settings need a second start
         more = growth(start, surfel_budget(settings.surfels, size.area * larger))
-        stages = FULL if settings.image.coarse == "off" else coarse.stages(size.span * larger**0.5)
-        return (left / one - more * (END_A_VIEW * views + END)) / iterations_time(more, 1.0, stages)
+        stages = FULL if settings.image.coarse == "off" else coarse.stages(size.span * larger**0.5, detail)
+        return (left / one - more * plan.end(views, one * more)) / iterations_time(more, 1.0, stages)
 
-    why = f"{plan.minutes:g} minutes were given"
+    plan.pace = pace
     found, count = quick, iterations(quick)
     for step in range(1, RICHER_STEPS + 1):
         richer = between(quick, standard, RICHEST * step / RICHER_STEPS)
@@ -66,9 +85,11 @@ def fitting(
     if found is quick:
         state = trainer.state
         state.report = report
+        plan.lower_detail((count / quick.train.iterations) ** 0.5 if count > 0 else 0.0)
+        coarse.begin(state, size.span, refined=state.part(Poses).values is not None)
         for event in said:
             report(*event)
-        settings = _scheduled(state.settings, max(count, 1.0) + REHEARSED, quick, standard)
+        settings = _scheduled(state.settings, max(count, 1.0) + len(marks), quick, standard)
         state.effective = state.effective.moved_to(settings, "plan", why)
         state.total = settings.train.iterations
     else:
@@ -97,14 +118,23 @@ def between(quick: Settings, standard: Settings, part: float) -> Settings:
     return validate(tables, "a time")
 
 
+def _with_detail(settings: Settings, detail: float) -> Settings:
+    """Multiply the number of surfels to start with by `detail`, and the number of voxels of the visual hull by its square."""
+    tables = settings.model_dump()
+    surfels = tables["surfels"]
+    surfels |= {"start": round(detail * surfels["start"]), "hull": round(detail ** (2 / 3) * surfels["hull"])}
+    return validate(tables, "a time")
+
+
 def _scheduled(settings: Settings, iterations: float, quick: Settings, standard: Settings) -> Settings:
     """Set the number of iterations, and adapt the schedule and the learning rates to it."""
     # Each step adds noise, because it uses one view. Outside of the range from `quick` to `standard`, rates are multiplied by √(n /
     # iterations), n the nearer of the two and the factor at most FASTEST, so that the noise of all steps together stays about the same.
     tables, part = settings.model_dump(), iterations / settings.train.iterations
     usual = min(max(iterations, quick.train.iterations), standard.train.iterations)
-    for section, name in (("train", "iterations"), *SCHEDULE):
-        tables[section][name] = max(1, round(part * tables[section][name]))
+    for section, name, least in (("train", "iterations", 1), *SCHEDULE):
+        now = tables[section][name]
+        tables[section][name] = round(max(part * now, min(least, now)))
     for name in RATES:
         tables["rates"][name] *= min((usual / iterations) ** 0.5, FASTEST)
     return validate(tables, "a time")

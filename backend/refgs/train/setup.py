@@ -29,10 +29,13 @@ from refgs.train.material import base_colors
 from refgs.train.material.metals import Metals
 from refgs.train.part import Part
 from refgs.train.photo import Photo
-from refgs.train.plan import Plan
+from refgs.train.plan import SHAPES, Plan
 from refgs.train.start import Start, start_appearance, start_parameters
 from refgs.train.state import State, why_not_traced
 from refgs.train.timeline import Step
+
+# Time for carving the visual hull's hollows, and for finding normals by outlines, in times of the hull without hollows.
+HOLLOWS, OUTLINES = 30, 2
 
 PARTS: tuple[type[Part], ...] = (
     Metals, Densification, Poses, Exposures, MirroredLight, TracedMesh, Coarse, Outlines, Priors, Means,
@@ -48,7 +51,9 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     with state.clock.part("start"):
         start = start_parameters(capture, state.views, state.settings)
     _choose_light_frame(state, start)
-    if state.from_hull and state.method.lit and state.settings.light.frame == "world":
+    hull = state.clock.seconds["start"]
+    still = state.from_hull and state.method.lit and state.settings.light.frame == "world"
+    if still and plan.pays_at_start("hollows of the visual hull", HOLLOWS * hull, SHAPES):
         with state.clock.part("start"):
             start = start_parameters(capture, state.views, state.settings, hollows=True)
     report("stage", {"what": start.said, "detail": True})
@@ -63,7 +68,8 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     size = object_size(state)
     limit_surfels(state, size.area)
     coarse.begin(state, size.span, refined=state.part(Poses).values is not None)
-    outlines.load(state, start.points.hull)
+    if plan.pays_at_start("normals that outlines tell", OUTLINES * hull):
+        outlines.load(state, start.points.hull)
     priors.load(state)
     return state
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from refgs.render.rendering import Rendering
 from refgs.settings import DensifySettings, RateSettings
 from refgs.train.photo import Photo
-from refgs.train.plan import Stage
+from refgs.train.plan import PART, SHAPES, Stage
 from refgs.train.start import GEOMETRY
 from refgs.train.state import State, why_not_traced
 
@@ -26,6 +26,7 @@ POSES_FROM, POSES_KNOWN, POSES_UNTIL = 0.05, 0.3, 2 / 3
 WHOLE_EVERY = 8  # one in this many iterations sees its whole photo, so that nothing stays beyond the margin of a crop
 REFLECTING = ("albedo", "metallic", "roughness", "indirect_dc", "indirect_rest", "environment", "exposure")
 PHOTO_STAGES = (0.35, 4), (0.7, 2)  # part of the training until which photos are reduced, and by what factor
+MESH_COST, DIVIDE_COST = 45, 2  # time for making a mesh, and for dividing surfels, in iterations
 FIRST_LINE, A_DECADE = 10, 10  # first iteration with a line in the history, and lines for each tenfold of iterations
 
 
@@ -80,6 +81,8 @@ class Row(NamedTuple):
     """Tell when one action is done: from `start` on and before `until`, in iterations that are multiples of `every`, if `only_if` holds.
 
     `clock` is the part of the training's clock (`refgs.clock`) to which the action's time is added. If it is None, `walk` does not time it.
+    `cost` is the time of an action that may be left out, in iterations: of each time if there is a period, else of all times together.
+    `most` is the fraction of a training's iterations that it may take at most, if a time is given.
     """
 
     what: str
@@ -88,6 +91,13 @@ class Row(NamedTuple):
     every: Every | None = None
     only_if: When | None = None
     clock: str | None = None
+    cost: int = 0
+    most: float = PART
+
+    def pays(self, state: State) -> bool:
+        """Tell whether the action is worth its time, if a time is given (see `Plan.pays`)."""
+        length = self.every.length(state) if self.every and self.every is not ONCE else state.total
+        return self.cost == 0 or state.plan.pays(self.what, self.cost / min(length, state.total), self.most)
 
     def due(self, state: State, step: Step) -> bool:
         """Tell whether the row is due in this iteration."""
@@ -208,10 +218,9 @@ def _resets(state: State, step: Step) -> bool:
     return step.done / state.total < state.settings.densify.stop and since_propagation(state, step.done) != 0
 
 
-def _first_plan(state: State, step: Step) -> bool:
-    """Tell whether to plan now: 10 iterations after `Plan.begin`, and at multiples of 50."""
-    since = step.done - state.plan.first
-    return since == 10 or (since > 0 and step.done % 50 == 0)
+def _plans(state: State, step: Step) -> bool:
+    """Tell whether to plan now: at multiples of 10 and at the end, but not within 5 iterations after `Plan.begin`."""
+    return step.done - state.plan.first >= 5 and (step.done % 10 == 0 or step.done >= state.total)
 
 
 def _judged(state: State, step: Step) -> bool:
@@ -281,16 +290,30 @@ AFTER = (
     Row("balance the exposures"),
     # Meshes and decisions come before an opacity reset, which makes all surfels faint. No mesh is made after the residual has started to
     # learn, because materials would no longer adapt to it.
-    Row("make a mesh", setting("indirect.start"), RESIDUAL, period("indirect.every"), NOT_INITIAL & NOT_ENDED & OPAQUE),
+    Row(
+        "make a mesh",
+        setting("indirect.start"),
+        RESIDUAL,
+        period("indirect.every"),
+        NOT_INITIAL & NOT_ENDED & OPAQUE,
+        cost=MESH_COST,
+    ),
     Row("decide on inter-reflection", only_if=NEW_MESH, clock="deciding"),
     Row("trace what surfels receive", only_if=NEW_MESH, clock="visibility"),
-    DECIDE("time the crops", iteration(100)),
-    DECIDE("look at a matte scene again", HALFWAY),
-    DECIDE("decide on specular shading", part_after_initial(0.05) & iteration(100)),
-    DECIDE("decide on the light's texels", part_after_initial(0.19)),
-    DECIDE("decide on degrees of harmonics", LATE),
-    DECIDE("find metals", part_after_initial(0.1) & iteration(100), RESIDUAL, only_if=METALS),
-    Row("judge metals", until=RESIDUAL, only_if=JUDGED & FROM_HULL & METALS, clock="deciding"),
+    DECIDE("time the crops", iteration(100), cost=6),
+    DECIDE("look at a matte scene again", HALFWAY, cost=60),
+    DECIDE("decide on specular shading", part_after_initial(0.05) & iteration(100), cost=60),
+    DECIDE("decide on the light's texels", part_after_initial(0.19), cost=40),
+    DECIDE("decide on degrees of harmonics", LATE, cost=40),
+    DECIDE("find metals", part_after_initial(0.1) & iteration(100), RESIDUAL, only_if=METALS, cost=180, most=SHAPES),
+    Row(
+        "judge metals",
+        until=RESIDUAL,
+        only_if=JUDGED & FROM_HULL & METALS,
+        clock="deciding",
+        cost=300,
+        most=SHAPES,
+    ),
     Row("even coloured metal out", None, part(0.6), iterations(50)),
     Row("level base colours", every=iterations(10)),
     Row("draw metals' base colours", None, part(0.6), iterations(10)),
@@ -304,7 +327,10 @@ AFTER = (
 """Rows that are done after Adam's step."""
 
 DIVIDE = Row("divide surfels, not only prune", until=setting("densify.stop"))
-PLAN = Row("plan the iterations that fit into the time", only_if=When("10 after the start, then every 50", _first_plan))
+PLAN = Row(
+    "plan the iterations that fit into the time",
+    only_if=When("every 10, and at the end: there may be time for more", _plans),
+)
 REPORT = Row("report the progress, look for broken numbers", every=iterations(10))
 RECORD = Row("measure errors into the history", only_if=NOT_ENDED & TENFOLD)
 CHECKPOINT = Row("write a checkpoint", every=period("train.checkpoint_every"), only_if=NOT_ENDED)

@@ -65,7 +65,7 @@ ACTIONS: dict[str, Callable[[State, Step], object]] = {
 def walk(rows: tuple[Row, ...], state: State, step: Step) -> None:
     """Run the actions of `rows` that are due at this step, in order."""
     for row in rows:
-        if row.due(state, step):
+        if row.due(state, step) and row.pays(state):
             with state.clock.part(row.clock) if row.clock else nullcontext():
                 ACTIONS[row.what](state, step)
 
@@ -135,7 +135,9 @@ class Trainer:
         """Train to the end or until `stop` returns true, save, and return whether it ended."""
         state, means = self.state, self.state.part(Means)
         before, first = state.seconds, state.iteration
-        more = growth(state.learned.count, state.settings.surfels.budget)
+        dividing = state.settings.densify
+        rounds = (dividing.stop - dividing.start) * state.total / dividing.every if dividing.every else 0
+        more = growth(state.learned.count, state.settings.surfels.budget, rounds)
         state.plan.begin(state.iteration, more, state.part(coarse.Coarse).stages)
         while not state.ended and not self._should_stop(stop):
             means.add(self.iterate())  # values are read only now and then, so that the CPU need not wait for a card

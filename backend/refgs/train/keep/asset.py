@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from refgs.camera import Camera
 from refgs.capture import write_cameras
 from refgs.errors import InputError
 from refgs.formats.exr import write_exr
@@ -22,6 +23,7 @@ from refgs.render.sums import blended_shares
 from refgs.render.volume import with_normals_last
 from refgs.run import OCCLUDER
 from refgs.run_folder import SPLATS, update_metrics
+from refgs.spread import spread
 from refgs.train.decide import needs
 from refgs.train.decide.need import Given
 from refgs.train.keep.questions import write_questions
@@ -29,6 +31,7 @@ from refgs.train.learn import poses
 from refgs.train.learn.exposures import exposure
 from refgs.train.learn.poses import Poses
 from refgs.train.material import metals
+from refgs.train.plan import DOUBT, DOUBT_A_VIEW
 from refgs.train.state import State, why_not_traced
 
 
@@ -55,7 +58,9 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
     surfels, constants = _with_constants(surfels, state, kept)
     splats = to_splats(surfels.chosen(kept))
     splats.constants = constants
-    if found := metals.doubt(state):
+    cost = DOUBT_A_VIEW * len(state.views) + DOUBT
+    found = metals.doubt(state) if state.plan.pays_at_end("what photos leave open about metals", cost) else None
+    if found:
         splats.doubt = found.values.numpy()[kept.numpy(force=True)]
         update_metrics(state.folder, {"doubt": found.facts})
     write_questions(state.folder, found.questions if found else [], surfels.positions, kept)
@@ -147,12 +152,17 @@ def _irradiance(surfels: Surfels, environment: Environment, state: State) -> Ten
     if environment.reference is None:
         return (surfels.received * environment.diffuse(normals)).clamp_min(1e-6)
     total, weights = torch.zeros_like(normals), torch.full_like(normals[:, :1], 1e-6)
-    for camera in (view.camera for view in state.views):
+    for camera in _cameras(state):
         cosine = facing_cosine(surfels.positions, normals, camera)[:, None]
         turn = torch.from_numpy(environment.turn(camera)).to(normals)
         total += cosine.abs() * environment.diffuse(cosine.sign() * normals @ turn.T)
         weights += cosine.abs()
     return (total / weights).clamp_min(1e-6)
+
+
+def _cameras(state: State) -> list[Camera]:
+    """Return the cameras of the training views, or of some, evenly spaced, if there is little time."""
+    return [view.camera for view in spread(state.views, state.plan.views_at_end())]
 
 
 def _seen_side(surfels: Surfels, state: State) -> Tensor:
@@ -164,9 +174,9 @@ def _seen_side(surfels: Surfels, state: State) -> Tensor:
     surfels = Surfels(*(value.detach() for value in surfels))
     normals = surfels.normals()
     side = seen = torch.zeros(len(normals), device=state.device)
-    for photo in state.photos:
-        weight = blended_shares(surfels, [photo.camera], state.near)[0]
-        side = side + weight * facing_cosine(surfels.positions, normals, photo.camera).sign()
+    for camera in _cameras(state):
+        weight = blended_shares(surfels, [camera], state.near)[0]
+        side = side + weight * facing_cosine(surfels.positions, normals, camera).sign()
         seen = seen + weight
     known = seen > 0 if (seen > 0).any() else torch.ones_like(seen, dtype=torch.bool)
     return torch.where(side < 0, -1.0, 1.0) * known
@@ -183,6 +193,8 @@ def _needs_rows(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) ->
         per = 3 * (settings.surfels.sh_degree + 1) ** 2
         add("spherical harmonics", "diffuse light comes from the environment", f"{per} parameters a surfel")
     left += method.left_out
+    for what, part in state.plan.left_out.items():
+        add(what, f"it would take {part:.0%} of the time given", "time for iterations")
     if method.deferred and state.occluder is None and "reflections" not in state.needs:
         why = why_not_traced(state) or _why_no_mesh(state)
         add("inter-reflection", why, "tracing rays, and harmonics of light from the object")

@@ -11,6 +11,7 @@ from refgs.paths import write_text
 from refgs.train.keep.checkpoint import DAMAGED, set_aside
 from refgs.train.keep.measures import Measures
 from refgs.train.keep.progress import Means
+from refgs.train.plan import FLIP
 from refgs.train.state import State
 from refgs.train.timeline import FIRST_LINE
 
@@ -45,7 +46,7 @@ def record(state: State, measures: Measures) -> None:
     facts = {"iteration": state.iteration, "seconds": round(state.seconds, 3), "loss": means.loss}
     facts |= {"psnr_train": means.psnr, "splats": state.learned.count}
     for part, measure in (("measuring", measures.errors), ("FLIP", measures.flip)):
-        if parts.get(part, 0.0) <= limit:
+        if parts.get(part, 0.0) <= limit and (part != "FLIP" or state.plan.pays_at_end("the image error FLIP", FLIP)):
             with state.clock.part(part):
                 facts |= measure(state)
     state.report("measured", dict(facts))

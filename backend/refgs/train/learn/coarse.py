@@ -11,7 +11,7 @@ from refgs.capture import LoadedView, reduced_views
 from refgs.run_folder import PHOTOS
 from refgs.train.part import Part
 from refgs.train.photo import MARGIN, Crop, Photo, crop_of
-from refgs.train.plan import FULL, Stage, iterations_time
+from refgs.train.plan import FULL, Stage, by_pixels, iterations_time
 from refgs.train.state import State
 from refgs.train.timeline import PHOTO_STAGES, POSES_KNOWN, Step, stage_at
 
@@ -37,9 +37,11 @@ class Coarse(Part):
         set_factor(state, facts["factor"])
 
 
-def stages(pixels: float) -> tuple[Stage, ...]:
-    """Plan the stages for an object that spans `pixels` in the full photos."""
-    return *(Stage(*stage) for stage in PHOTO_STAGES if pixels / stage[1] >= LEAST_SPAN), *FULL
+def stages(pixels: float, detail: float = 1.0) -> tuple[Stage, ...]:
+    """Plan the stages for an object that spans `pixels` in the full photos. With less `detail`, 0..1, smaller objects have them, too."""
+    least, area = detail * LEAST_SPAN, pixels**2
+    reduced = ((until, factor) for until, factor in PHOTO_STAGES if pixels / factor >= least)
+    return *(Stage(until, factor, by_pixels(area, factor**-2)) for until, factor in reduced), *FULL
 
 
 def begin(state: State, pixels: float, refined: bool) -> None:
@@ -49,7 +51,7 @@ def begin(state: State, pixels: float, refined: bool) -> None:
     """
     if state.settings.image.coarse == "off":
         return
-    found = stages(pixels)
+    found = stages(pixels, state.plan.detail)
     if refined:
         found = *(stage for stage in found if stage.until <= POSES_KNOWN), *FULL
     state.part(Coarse).stages = found

@@ -26,6 +26,7 @@ from refgs.train.timeline import POSES_FROM, POSES_KNOWN, Step
 LONGEST_STEP = 0.02  # largest step, in radians and in scene radii
 SAMPLE = 1000  # surfels whose shift in the photos is measured
 EXACT = 0.3  # pixels between features and epipolar lines; poses with less are exact; real captures have 0.1
+MATCHING = 0.6  # time for matching features, in times of reading the photos and placing the first surfels
 BETTER = 0.5  # refined poses must come below this fraction of the given poses' distance
 
 
@@ -46,6 +47,10 @@ class Poses(Part):
         Poses are refined if the setting `cameras.poses` is "on", or if it is "auto" and matched features contradict the given cameras.
         """
         self.given, wanted = [view.camera for view in state.views], state.settings.cameras.poses
+        known = state.clock.seconds
+        seconds = MATCHING * (known["reading"] + known["start"])
+        if wanted == "auto" and not state.plan.pays_at_start("a look at whether poses need refinement", seconds):
+            wanted = "off"
         if wanted == "auto":
             with state.clock.part("start"):
                 apart = pixels_apart(match_neighbours(state.views), self.given)
