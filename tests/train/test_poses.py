@@ -1,6 +1,7 @@
 """Test the refinement of poses in a training, on captures whose poses are exact or disturbed."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from refgs.capture import read_capture
 from refgs.capture.matches import Matches
 from refgs.run import open_run
 from refgs.settings import load_settings
+from refgs.train.keep import asset
 from refgs.train.learn import poses
 from refgs.train.learn.poses import Poses
 from tests.makers.training import check_equal, do, trained, trainer
@@ -113,3 +115,10 @@ def test_a_resumed_training_has_the_same_poses(moved, tmp_path):
     check_equal(whole, second)
     one, other = (made.state.part(Poses).values for made in (whole, second))
     assert torch.equal(one, other) and one.any()
+
+
+def test_sides_of_surfels_are_those_that_refined_cameras_see(ball_capture, tmp_path):
+    state = trainer(ball_capture, tmp_path / "run", total=1).state
+    moved = replace(state.photos[0].camera, world_to_camera=np.eye(4))
+    state.photos[0] = state.photos[0]._replace(camera=moved)
+    assert asset._cameras(state) == [photo.camera for photo in state.photos]

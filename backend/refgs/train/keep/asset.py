@@ -161,8 +161,8 @@ def _irradiance(surfels: Surfels, environment: Environment, state: State) -> Ten
 
 
 def _cameras(state: State) -> list[Camera]:
-    """Return the cameras of the training views, or of some, evenly spaced, if there is little time."""
-    return [view.camera for view in spread(state.views, state.plan.views_at_end())]
+    """Return the cameras of the photos, with refined poses; or of some, evenly spaced, if there is little time."""
+    return [photo.camera for photo in spread(state.photos, state.plan.views_at_end())]
 
 
 def _seen_side(surfels: Surfels, state: State) -> Tensor:
