@@ -41,12 +41,8 @@ def fitting(
     If `quick` is chosen, the training continues after the measured iterations. Otherwise it starts anew. `effective` holds the settings of
     the preset `quick`, and `standard` those of the preset `standard`. Both include the user's changes.
     """
-    why, begun, said, detail = (
-        f"{plan.minutes:g} minutes were given",
-        plan.spent,
-        [],
-        plan.lower_detail(STARTS * plan.given / plan.spent),
-    )
+    why, begun, said = f"{plan.minutes:g} minutes were given", plan.spent, []
+    detail = plan.lower_detail(STARTS * plan.given / plan.spent)
     effective = effective.moved_to(_with_detail(effective.settings, detail), "plan", why)
     quick = effective.settings
     trainer = Trainer(capture, effective, folder, lambda *event: said.append(event), plan, device)

@@ -10,10 +10,9 @@ STARTS, LEAST_DETAIL = 0.05, 0.5
 LEAST_VIEWS = 16  # of the photos that are rendered for the asset, if there is little time
 DOUBT_A_VIEW, DOUBT = 0.8, 120  # time for measuring what photos leave open about metals, in iterations, as above
 TRADES, FLIP = 20, 8  # time for measuring what light and materials can make up for, and FLIP, in iterations
-PART = (
-    0.1  # of the time that is left, or of all iterations: an optional part of the training that takes more is left out
-)
-SHAPES = 0.3  # the same, for what decides whether metals are metal and hollows are open: without it, much else is wrong
+# Parts of the time that is left, or of all iterations: an optional part of the training that takes more is left out. SHAPES is for what
+# decides whether metals are metal and hollows are open: without it, much else is wrong.
+PART, SHAPES = 0.1, 0.3
 # Iterations slow down as surfels are divided and inter-reflection starts. The slowdown is linear between these parts of a training.
 GROWS = 0.1, 0.3
 OTHERS = 16_000  # number of surfels that takes as long as the rest of an iteration
@@ -68,6 +67,11 @@ def growth(first: int, last: int, rounds: float = math.inf) -> float:
     return MIRRORED * (OTHERS + max(last, first)) / (OTHERS + first)
 
 
+def doubt(views: int) -> float:
+    """Return the time for measuring what photos leave open about metals, in iterations."""
+    return DOUBT_A_VIEW * views + DOUBT
+
+
 class Plan:
     """Plan a training, asset included, to end within a given time, not counting pauses."""
 
@@ -78,9 +82,8 @@ class Plan:
         self._growth, self._stages, self._marks = 1.0, FULL, [(0, 0.0)]
         self.pace = 0.0  # seconds that an iteration on full photos is expected to take at the end
         self.detail = 1.0  # how much detail there is time for at first, 1 if all
-        self.left_out: dict[
-            str, float
-        ] = {}  # optional parts that do not pay, and which fraction of the time each would take
+        # Optional parts that do not pay, and which fraction of the time each would take.
+        self.left_out: dict[str, float] = {}
 
     @property
     def given(self) -> float:
@@ -108,7 +111,7 @@ class Plan:
 
     def end(self, views: int, pace: float) -> float:
         """Return how many iterations take as long as the end, if one takes `pace` seconds. The end evaluates, and writes the asset."""
-        optional = DOUBT_A_VIEW * views + DOUBT, TRADES, FLIP
+        optional = doubt(views), TRADES, FLIP
         rendered = min(views, self.views_at_end(pace))
         return END_A_VIEW * rendered + END + sum(each for each in optional if each * pace <= PART * self.given)
 

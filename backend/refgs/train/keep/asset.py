@@ -31,7 +31,7 @@ from refgs.train.learn import poses
 from refgs.train.learn.exposures import exposure
 from refgs.train.learn.poses import Poses
 from refgs.train.material import metals
-from refgs.train.plan import DOUBT, DOUBT_A_VIEW
+from refgs.train.plan import doubt
 from refgs.train.state import State, why_not_traced
 
 
@@ -58,8 +58,8 @@ def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) 
     surfels, constants = _with_constants(surfels, state, kept)
     splats = to_splats(surfels.chosen(kept))
     splats.constants = constants
-    cost = DOUBT_A_VIEW * len(state.views) + DOUBT
-    found = metals.doubt(state) if state.plan.pays_at_end("what photos leave open about metals", cost) else None
+    what = "what photos leave open about metals"
+    found = metals.doubt(state) if state.plan.pays_at_end(what, doubt(len(state.views))) else None
     if found:
         splats.doubt = found.values.numpy()[kept.numpy(force=True)]
         update_metrics(state.folder, {"doubt": found.facts})

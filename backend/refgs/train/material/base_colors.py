@@ -35,7 +35,7 @@ from refgs.spread import spread
 from refgs.train.learn import light
 from refgs.train.material import same_material
 from refgs.train.material.observe import mean_over, neighbours
-from refgs.train.material.reckoning import Reckoned
+from refgs.train.material.reckoning import Reckoned, principal_axis
 from refgs.train.state import State
 
 DARKEST, BRIGHTEST = 0.02, 0.98  # base colours
@@ -117,9 +117,8 @@ def told_hue(found: Reckoned, paint: Tensor) -> Tensor:
     A dielectric's highlight has the light's colour (Shafer 1985), so the radiance of paint changes from photo to photo along that colour.
     The more a surfel changes, the more it counts. The wider the surfels differ, the less their median is trusted against grey.
     """
-    values, vectors = torch.linalg.eigh(found.changes)
-    axis = vectors[..., 2] * vectors[..., 2].sum(dim=1, keepdim=True).sign()
-    weight = found.pixels * paint * found.known * values[:, 2] * (axis > 0).all(dim=1)
+    axis, change = principal_axis(found.changes)
+    weight = found.pixels * paint * found.known * change * (axis > 0).all(dim=1)
     if weight.sum() <= 0:
         return torch.zeros(3)
     logs = axis.clamp_min(1e-3).log()

@@ -92,9 +92,9 @@ def _judge(state: State, first: bool = False) -> None:
     metallic[metal], metallic[paint] = raw_metallic(HELD.metal), raw_metallic(HELD.paint)
     state.learned["told"].copy_(metal | paint)
     shown = state.learned["shown_color"]
-    sure = _sure_kinds(state)[0].cpu()
+    sure, painted = (kind.cpu() for kind in _sure_kinds(state))
     shown.copy_(base_colors.told(found, sure))
-    state.part(Metals).hue = base_colors.told_hue(found, _sure_kinds(state)[1].cpu()).to(state.device)
+    state.part(Metals).hue = base_colors.told_hue(found, painted).to(state.device)
     colored = state.from_hull and bool(shown.any())
     state.told_light = base_colors.told_light(found, sure).to(state.device) if colored else None
     if raised.any():

@@ -179,14 +179,23 @@ def mean_and_changes(seen: Seen, near: Tensor) -> tuple[Tensor, Tensor]:
     return mean, change.transpose(1, 2) @ change / count[:, None]
 
 
+def principal_axis(covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the unit axes (N, 3) along which colours change most, brighter in the sum, and their variances (N,) there.
+
+    `covariance` (N, 3, 3) is that of linear colours.
+    """
+    values, vectors = torch.linalg.eigh(covariance)
+    axis = vectors[:, :, 2]
+    return axis * torch.sign(axis.sum(dim=1, keepdim=True)), values[:, 2]
+
+
 def _tint(mean: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
     """Compute how much the radiance of surfels and their neighbours changes along their own colour, and which have none: (N,) each.
 
     A dielectric's reflection has the light's colour, which is grey on average. The direction of change is the first principal axis of the
     radiance over the photos. See `mean_and_changes` for `mean` (N, 3) and `covariance` (N, 3, 3).
     """
-    axis = torch.linalg.eigh(covariance).eigenvectors[:, :, 2]
-    axis = axis * torch.sign(axis.sum(dim=1, keepdim=True))
+    axis = principal_axis(covariance)[0]
     axis = axis / axis.sum(dim=1, keepdim=True).clamp_min(0.2)
     own = from_grey(mean)
     colour = own.norm(dim=1)
