@@ -214,6 +214,9 @@ class LossSettings(_Section):
     outlines: float = Field(
         ge=0, description="agreement of normals with outlines of the masks, where these show the surface"
     )
+    mesh: float = Field(
+        ge=0, description="agreement of rough paint's normals with the mesh that reflections are traced on"
+    )
     exposure: float = Field(ge=0, description="penalty of a photo's exposure or white balance that differs from most")
 
 

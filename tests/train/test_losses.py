@@ -30,6 +30,7 @@ ALL = LossSettings(
     light=0.0,
     prior=0.0,
     outlines=0.0,
+    mesh=0.0,
     exposure=0.0,
 )
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])

@@ -21,6 +21,7 @@ from refgs.train.learn.coarse import Coarse
 from refgs.train.learn.densify import Densification
 from refgs.train.learn.exposures import EXPOSURE, Exposures
 from refgs.train.learn.light import MirroredLight
+from refgs.train.learn.mesh_normals import MeshNormals
 from refgs.train.learn.outlines import Outlines
 from refgs.train.learn.poses import Poses
 from refgs.train.learn.priors import Priors
@@ -38,7 +39,7 @@ from refgs.train.timeline import Step
 HOLLOWS, OUTLINES = 30, 2
 
 PARTS: tuple[type[Part], ...] = (
-    Metals, Densification, Poses, Exposures, MirroredLight, TracedMesh, Coarse, Outlines, Priors, Means,
+    Metals, Densification, Poses, Exposures, MirroredLight, TracedMesh, Coarse, Outlines, MeshNormals, Priors, Means,
 )  # fmt: skip
 """The parts of a training that remember something, in the order in which a checkpoint restores them."""
 

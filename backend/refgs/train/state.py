@@ -128,7 +128,7 @@ class State:
         """Return the loss weights, 0 for terms of metals and roughness without specular shading."""
         weights = self.settings.loss
         if self.settings.render.reflection == "none":
-            return weights.model_copy(update={"even": 0.0, "metallic": 0.0, "matte": 0.0, "outlines": 0.0})
+            return weights.model_copy(update={"even": 0.0, "metallic": 0.0, "matte": 0.0, "outlines": 0.0, "mesh": 0.0})
         return weights
 
     def surfels(self) -> Surfels:

@@ -19,7 +19,7 @@ from refgs.train.decide.need import Given
 from refgs.train.keep import checkpoint, history, snapshot
 from refgs.train.keep.measures import Measures
 from refgs.train.keep.progress import Means
-from refgs.train.learn import coarse, densify, exposures, light, outlines, poses, priors, trace
+from refgs.train.learn import coarse, densify, exposures, light, mesh_normals, outlines, poses, priors, trace
 from refgs.train.learn.guard import Guard, warn
 from refgs.train.learn.losses import departure, objective
 from refgs.train.learn.rates import set_rates
@@ -112,7 +112,7 @@ class Trainer:
         loss, square = objective(step.rendering, mean, step.photo, state.background, state.losses, step.progress)
         if "exposure" in state.learned:
             loss = loss + state.settings.loss.exposure * departure(state.learned["exposure"][step.view])
-        for given in (outlines.loss(state, step), priors.loss(state, step)):
+        for given in (outlines.loss(state, step), mesh_normals.loss(state, step), priors.loss(state, step)):
             loss = loss if given is None else loss + given
         loss.backward()
         metals.hold(state)
