@@ -55,13 +55,16 @@ def apart(told: ToldNormals, step: Step) -> float:
     return (1 - cosine_similarity(step.rendering.normal.detach()[row, column], told.normals)).mean().item()
 
 
-def descend(state, step: Step, loss) -> None:
-    """Take 30 steps of the rendered normals down the gradient of a loss."""
+def check_drawn(state, step: Step, told: ToldNormals, loss) -> None:
+    """Check that 30 steps down the gradient of a loss bring the rendered normals to those told."""
+    assert len(told.plane) > 200
+    before = apart(told, step)
     for _ in range(30):
         normal = step.rendering.normal
         (gradient,) = torch.autograd.grad(loss(state, step), normal)
         moved = normal.detach() - 0.02 * torch.nn.functional.normalize(gradient, dim=-1)
         step.rendering = replace(step.rendering, normal=moved.requires_grad_())
+    assert apart(told, step) < 0.3 * before
 
 
 def ball(radius: float) -> Occluder:
@@ -72,11 +75,7 @@ def ball(radius: float) -> Occluder:
 
 def test_metal_is_drawn_to_the_normals_that_outlines_tell(folder, tmp_path):
     state = state_of(folder, tmp_path)
-    step, told = rendered(state, 1.0), state.part(Outlines).told[0]
-    assert len(told.plane) > 200
-    before = apart(told, step)
-    descend(state, step, outlines.loss)
-    assert apart(told, step) < 0.3 * before
+    check_drawn(state, rendered(state, 1.0), state.part(Outlines).told[0], outlines.loss)
 
 
 def test_rough_paint_is_drawn_to_the_normals_of_the_mesh(folder, tmp_path):
@@ -84,11 +83,7 @@ def test_rough_paint_is_drawn_to_the_normals_of_the_mesh(folder, tmp_path):
     step = rendered(state, 0.0)
     assert mesh_normals.loss(state, step) is None
     state.occluder = ball(state.capture.radius / 2)
-    told = state.part(MeshNormals).told(state, state.occluder, 0)
-    assert len(told.plane) > 200
-    before = apart(told, step)
-    descend(state, step, mesh_normals.loss)
-    assert apart(told, step) < 0.3 * before
+    check_drawn(state, step, state.part(MeshNormals).told(state, state.occluder, 0), mesh_normals.loss)
 
 
 def test_metal_and_glossy_paint_are_not(folder, tmp_path):

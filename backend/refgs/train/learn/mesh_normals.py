@@ -44,5 +44,4 @@ def loss(state: State, step: Step) -> Tensor | None:
     if weight == 0 or mesh is None:
         return None
     told = state.part(MeshNormals).told(state, mesh, step.view)
-    far = told.departure(step, lambda metallic, roughness: (1 - metallic) * roughness**2)
-    return None if far is None else weight * far
+    return told.loss(step, weight, lambda metallic, roughness: (1 - metallic) * roughness**2)

@@ -42,5 +42,4 @@ def loss(state: State, step: Step) -> Tensor | None:
     told, weight = state.part(Outlines).told.get(step.view), state.losses.outlines
     if told is None or weight == 0:
         return None
-    far = told.departure(step, lambda metallic, _: metallic)
-    return None if far is None else weight * far
+    return told.loss(step, weight, lambda metallic, _: metallic)

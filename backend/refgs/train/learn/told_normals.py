@@ -40,11 +40,11 @@ class ToldNormals(NamedTuple):
         at, outward = (torch.from_numpy(x.astype(np.float32)).to(device) for x in (plane, normals))
         return ToldNormals(at, outward, 1 / (small.width * small.height))
 
-    def departure(self, step: Step, trust: Callable[[Tensor, Tensor], Tensor]) -> Tensor | None:
-        """Compute how far a step's normals are from those told: a mean over the pixels of the whole photo, also if a crop is rendered.
+    def loss(self, step: Step, weight: float, trust: Callable[[Tensor, Tensor], Tensor]) -> Tensor | None:
+        """Compute `weight` times how far a step's normals are from those told. Return None if the rendering has no material.
 
-        It saturates: t · e / (e + WRONG) at a place where 1 − the cosine is e. `trust` computes t from metallic and roughness, (K,) each.
-        Return None if the rendering has no material.
+        The loss is a scalar: a mean over the pixels of the whole photo, also if only a crop is rendered. It saturates: t · e / (e + WRONG)
+        at a place where 1 − the cosine is e. `trust` computes t from metallic and roughness, (K,) each.
         """
         rendering, camera = step.rendering, step.photo.camera
         if rendering.material is None:
@@ -58,4 +58,4 @@ class ToldNormals(NamedTuple):
         material = rendering.material.detach().flatten(0, 1).index_select(0, at)
         counts = shown * (alpha > SOLID) * trust(material[:, 3], material[:, 4])
         error = 1 - cosine_similarity(rendering.normal.flatten(0, 1).index_select(0, at), self.normals, dim=1)
-        return self.part * (counts * error / (error + WRONG)).sum()
+        return weight * (self.part * (counts * error / (error + WRONG)).sum())
