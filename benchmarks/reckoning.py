@@ -4,8 +4,8 @@ Each capture is a folder of `benchmarks.scenes` under the scene's name, so that 
 or `--paint`: all of it is that. A training of each stops after two thirds. At a tenth, a third, and then, the terms of
 `refgs.train.material.reckoning` are written to DIR. Captures that DIR holds are not trained again.
 
-A logistic regression on the captures before `--show` gives the weights. The table says how they do on all captures: which part of the
-surface is wrong, in doubt, and right where it is not in doubt.
+A logistic regression on the captures before `--show` gives the weights. They are drawn to those in use, which were fitted to other captures.
+The table says how they do on all captures: which part of the surface is wrong, in doubt, and right where it is not in doubt.
 """
 
 import argparse
@@ -29,14 +29,14 @@ from refgs.train.trainer import Trainer
 
 TOTAL, TIMES = 1500, (150, 500, 1000)
 SAMPLES = 1500  # surfels of each capture at each time, drawn by their pixels
-RIDGE = 1e-4
+PRIOR = 3e-3  # weight of the weights in use
 
 MetalAt = Callable[[np.ndarray], Tensor]
 """From points (N, 3), in the capture's frame, to whether each is metal (N,)."""
 
 
 class Row(NamedTuple):
-    """Hold spread terms (N, K), whether each surfel is metal (N,), and its pixels (N,)."""
+    """Hold spread terms (N, 1 + K), the first of them 1, whether each surfel is metal (N,), and its pixels (N,)."""
 
     terms: Tensor
     metal: Tensor
@@ -82,8 +82,8 @@ def observed(capture: Path, kind: bool | None, out: Path) -> Iterable[Row]:
 
 def row(state: State, metal_at: MetalAt, to_capture: np.ndarray) -> Row:
     found = reckoning.reckon(state)
-    values = torch.stack([found.terms[name] for name in reckoning.WEIGHTS], dim=1)
-    spread = [same_material.spread(found.graph, each, found.known.float()) for each in values.T]
+    values = torch.ones(len(found.pixels)), *(found.terms[name] for name in reckoning.WEIGHTS)
+    spread = [same_material.spread(found.graph, each, found.known.float()) for each in values]
     points = found.surfels.positions.double().numpy()
     points = (np.c_[points, np.ones(len(points))] @ to_capture.T)[:, :3]
     return Row(torch.stack(spread, dim=1), metal_at(points), found.pixels)
@@ -106,7 +106,10 @@ def true_metal(name: str) -> MetalAt:
 
 
 def fitted(captures: list[list[Row]]) -> Tensor:
-    """Fit a logistic regression with a small ridge, by Newton's method. Each capture counts the same. Returns the bias and the weights."""
+    """Fit a logistic regression by Newton's method. Each capture counts the same. Returns the bias and the weights (1 + K,).
+
+    Weights are drawn to those in use in proportion to the standard deviation of their terms.
+    """
     generator, parts = torch.Generator().manual_seed(0), []
     for rows in captures:
         for each in rows:
@@ -115,22 +118,21 @@ def fitted(captures: list[list[Row]]) -> Tensor:
                 (each.terms[drawn].double(), each.metal[drawn].double(), torch.full((SAMPLES,), 1 / len(rows)))
             )
     terms, metal, weight = (torch.cat(each) for each in zip(*parts, strict=True))
-    mean, scale, weight = terms.mean(dim=0), terms.std(dim=0).clamp_min(1e-6), weight.double() / weight.sum()
-    columns = torch.cat([torch.ones(len(terms), 1).double(), (terms - mean) / scale], dim=1)
-    ridge = RIDGE * torch.eye(columns.shape[1]).double()
-    ridge[0, 0] = 0
-    found = torch.zeros(columns.shape[1]).double()
+    scale, weight = terms.std(dim=0).clamp_min(1e-6), weight.double() / weight.sum()
+    scale[0] = 1
+    columns, prior = terms / scale, PRIOR * torch.eye(terms.shape[1]).double()
+    prior[0, 0] *= 0.1  # the odds before any test depend the most on the captures
+    found = used = torch.tensor([reckoning.BIAS, *reckoning.WEIGHTS.values()]).double() * scale
     for _ in range(50):
         likely = torch.sigmoid(columns @ found)
-        slope = columns.T @ (weight * (likely - metal)) + ridge @ found
-        curvature = (columns.T * (weight * likely * (1 - likely))) @ columns + ridge
-        found = found - torch.linalg.solve(curvature + 1e-9 * torch.eye(len(found)).double(), slope)
-    weights = found[1:] / scale
-    return torch.cat([found[:1] - (weights * mean).sum(), weights]).float()
+        slope = columns.T @ (weight * (likely - metal)) + prior @ (found - used)
+        curvature = (columns.T * (weight * likely * (1 - likely))) @ columns + prior
+        found = found - torch.linalg.solve(curvature, slope)
+    return (found / scale).float()
 
 
 def line(row: Row, weights: Tensor) -> str:
-    likely = torch.sigmoid(weights[0] + row.terms @ weights[1:])
+    likely = torch.sigmoid(row.terms @ weights)
     right, sure = (likely > 0.5) == row.metal, (2 * likely - 1).abs() > questions.DOUBTFUL
     part = row.pixels / row.pixels.sum()
     among = float((part * sure * right).sum() / (part * sure).sum().clamp_min(1e-9))

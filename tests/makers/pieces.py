@@ -29,7 +29,8 @@ def seen_as(points, normals, mean=None, shown=None):
     mean = torch.full((count, 3), 0.5) if mean is None else mean
     one = torch.ones(count, 1)
     pixels = 9 * (torch.ones(count) if shown is None else shown.float())
-    return Seen(mean[:, None], 9 * one, pixels, mean, normals[:, None], normals[:, None])
+    clipped = torch.zeros(count, 1, 3, dtype=torch.bool)
+    return Seen(mean[:, None], clipped, 9 * one, pixels, mean, normals[:, None], normals[:, None])
 
 
 def reckoned(points, normals, metal, metallic, by_object=False):

@@ -104,10 +104,10 @@ def told(found: Reckoned, metals: Tensor) -> Tensor:
 def told_light(found: Reckoned, metals: Tensor) -> Tensor:
     """Tell which texels (6·SIDE²,) of the light photos show in `metals` (N,)."""
     seen, pixels = found.seen, torch.zeros(6 * SIDE**2)
-    for view in range(seen.weight.shape[1]):
-        shows = metals & (seen.weight[:, view] > 0) & ~found.met[:, view]
+    for view, weight in enumerate(seen.exact.T):
+        shows = metals & (weight > 0) & ~found.met[:, view]
         directions = mirror(-seen.towards[shows, view], seen.normal[shows, view])
-        pixels.index_add_(0, cubemap.texels_at(directions, SIDE), seen.weight[shows, view])
+        pixels.index_add_(0, cubemap.texels_at(directions, SIDE), weight[shows])
     return pixels > LEAST_MIRRORED
 
 

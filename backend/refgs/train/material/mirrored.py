@@ -6,6 +6,9 @@ object, the mean radiance that photos show there. So the material of the mirrore
 
 In a dark room, the light is learned too bright where it is dark. Then black paint explains a metal as well. So both are also fitted to the
 photos alone in which the mirror ray meets the object: these do not depend on the light.
+
+Photos clip the highlights of metals more often than anything else. There, a surfel is at least as bright as the photo: a model that is
+brighter has no error.
 """
 
 from collections.abc import Iterable, Iterator
@@ -30,6 +33,7 @@ ROUGHNESSES = 0.05, 0.2, 0.45  # roughnesses that are tried
 TOLERANCE = 0.15  # fraction of the radiance: smaller errors of either kind tell nothing
 BRIGHTEST = 20.0  # largest radiance of a mirrored lamp: photos clip it
 MIDDLE = 1  # index of the roughness by which changes are compared
+NEWTON_STEPS = 3
 
 
 class Fit(NamedTuple):
@@ -37,17 +41,15 @@ class Fit(NamedTuple):
 
     - `ratio` (N,): the logarithm of the squared error as a metal, divided by that as paint
     - `reflectance` (N, 3), `roughness` (N,): values of the metal that fits best; its reflectance is a mean over the neighbours
-    - `mirrored` (N,): the mean radiance that they mirror
     - `pixels` (N,): their pixels in these photos
-    - `reflected`, `white` (N, 3): what they show in all of these photos together, and what a metal of reflectance 1 would show. Where
-      normals err, `reflectance` is too low: surfels mirror other points than their rays meet. Together they mirror the same, so that sums
-      tell more.
+    - `reflected`, `white` (N, 3): what they show in all of these photos together, and what a metal of reflectance 1 would show, unless
+      clipped. Where normals err, `reflectance` is too low: surfels mirror other points than their rays meet. Together they mirror the
+      same, so that sums tell more.
     """
 
     ratio: Tensor
     reflectance: Tensor
     roughness: Tensor
-    mirrored: Tensor
     pixels: Tensor
     reflected: Tensor
     white: Tensor
@@ -117,63 +119,94 @@ def _at_vertices(surfels: Surfels, seen: Seen, mesh: Mesh) -> Tensor:
     return torch.from_numpy(blend(surfels, seen.outward.double().numpy(), mesh.vertices, normals) @ seen.mean.numpy())
 
 
-class _Sums:
-    """Add up, over photos, what the fits of metal and of paint need of N surfels.
+class _Photo(NamedTuple):
+    """Hold what a fit needs of one photo: `weight` (N,), linear radiance `shown`, and whether it is `clipped` (N, 3).
 
-    Let R be what a surfel mirrors. A metal of reflectance s shows (s FG0 + FG1) R. Paint of diffuse radiance c shows c + F R. FG0, FG1
-    and F are the channels 0, 1 and 3 of `brdf.reflectance_table`. Both fits need only sums over the photos.
+    `mirrored` (N, 3) is what is mirrored at each of the first of ROUGHNESSES. `tables` (N, 4, 1) are `brdf.reflectance_table` there.
     """
 
-    def __init__(self, count: int, roughnesses: tuple[float, ...]) -> None:
-        self._roughnesses = roughnesses
-        names, shape = ("shown", "light", "rest", "both", "power", "paint", "first"), (len(roughnesses), count, 3)
-        self._sums = {name: torch.zeros(shape, dtype=torch.double) for name in names}
-        # Sums of weights, the mirrored, the shown, and its square.
-        self._whole = torch.zeros(count, 8, dtype=torch.double)
+    weight: Tensor
+    shown: Tensor
+    clipped: Tensor
+    mirrored: list[Tensor]
+    tables: list[Tensor]
 
-    def add(self, weight: Tensor, shown: Tensor, mirrored: list[Tensor], cosine: Tensor) -> None:
-        """Add one photo: weights (N,), linear radiance (N, 3), what is mirrored at each of ROUGHNESSES (N, 3), cosines (N,)."""
-        weight = weight[:, None]
-        for index, (roughness, light) in enumerate(zip(self._roughnesses, mirrored, strict=False)):
-            first, second, _, coat = look_up(cosine, torch.full_like(cosine, roughness)).unsqueeze(2).unbind(dim=1)
-            rest, reflected, dull = shown - second * light, first * light, shown - coat * light
-            self._sums["shown"][index] += weight * rest
-            self._sums["light"][index] += weight * reflected
-            self._sums["rest"][index] += weight * rest.square()
-            self._sums["both"][index] += weight * rest * reflected
-            self._sums["power"][index] += weight * reflected.square()
-            self._sums["paint"][index] += weight * dull.square()
-            self._sums["first"][index] += weight * dull
-        light = mirrored[MIDDLE].mean(dim=1, keepdim=True)
-        self._whole += weight * torch.cat([torch.ones_like(light), light, shown, shown.square()], dim=1)
+    @classmethod
+    def of(cls, seen: Seen, view: int, mirrored: list[Tensor]) -> "_Photo":
+        cosine = (seen.normal[:, view] * seen.towards[:, view]).sum(dim=1).clamp(GRAZING, 1)
+        tables = [look_up(cosine, torch.full_like(cosine, roughness))[..., None] for roughness in ROUGHNESSES]
+        return cls(seen.weight[:, view], seen.radiance[:, view], seen.clipped[:, view], mirrored, tables)
 
-    def fit(self, near: Tensor, by_power: bool) -> Fit:
-        """Keep each surfel's best metal and best paint. Errors are added up over the neighbours `near` (N, K).
+    def part(self, which: Tensor, kinds: int) -> "_Photo":
+        """Return what the surfels `which` (N,) show, and what is mirrored at the first `kinds` roughnesses."""
+        return self._replace(weight=self.weight * which, mirrored=self.mirrored[:kinds], tables=self.tables[:kinds])
 
-        With `by_power`, a surfel counts for the mean reflectance by the square of what it mirrors. That is best where the mirrored radiance
-        is known, as that of the object. A lamp's is not, because photos clip it.
+    def models(self) -> tuple[Tensor, Tensor]:
+        """Return linear models, (H, N, 3) each: a model shows the first + value · the second, with one unknown value a channel.
+
+        Let R be what a surfel mirrors. A metal of reflectance s shows (s FG0 + FG1) R. Paint of diffuse radiance c shows c + F R. FG0, FG1
+        and F are the channels 0, 1 and 3 of the table. The models are a metal for each roughness, paint for each roughness, and paint that
+        mirrors nothing.
         """
-        sums, (total, light, mean, square) = self._sums, self._whole.split([1, 1, 3, 3], dim=1)
-        some = total.clamp_min(1e-6)
-        reflectance = (sums["both"] / sums["power"].clamp_min(1e-12)).clamp(0, 1)
-        metal = (sums["rest"] - 2 * reflectance * sums["both"] + reflectance.square() * sums["power"]).sum(dim=2)
-        diffuse = (sums["first"] / some).clamp_min(0)
-        paint = (sums["paint"] - 2 * diffuse * sums["first"] + diffuse.square() * total).sum(dim=2)
-        steady = (square - mean.square() / some).sum(dim=1)  # paint that mirrors nothing
-        errors = torch.cat([metal, paint, steady[None], TOLERANCE**2 * square.sum(dim=1)[None]]).clamp_min(0)
-        errors = pooled(errors.T.float(), near)
-        metal, paint, least = errors.split([len(metal), len(paint) + 1, 1], dim=1)
-        ratio = (metal.amin(dim=1) + least[:, 0]) / (paint.amin(dim=1) + least[:, 0]).clamp_min(1e-12)
-        best = metal.argmin(dim=1)
-        rows = best, torch.arange(len(best))
-        weight = sums["power"][rows] if by_power else total.expand(-1, 3)
-        columns = reflectance[rows] * weight, weight, sums["shown"][rows], sums["light"][rows], light, total
-        summed = pooled(torch.cat(columns, dim=1).float(), near)
-        chosen, weight, shown, white, light, pixels = summed.split([3, 3, 3, 3, 1, 1], dim=1)
-        chosen, light = chosen / weight.clamp_min(1e-12), light / pixels.clamp_min(1e-6)
-        rough = torch.tensor(self._roughnesses)[best]
-        values = ratio.clamp_min(1e-12).log(), chosen, rough, light[:, 0], pixels[:, 0], shown, white
-        return Fit(*(each.float() for each in values))
+        each = [*zip(self.tables, self.mirrored, strict=True)]
+        one = torch.ones_like(self.shown)
+        metal = [(table[:, 1] * light, table[:, 0] * light) for table, light in each]
+        paint = [(table[:, 3] * light, one) for table, light in each]
+        offset, slope = zip(*metal, *paint, (torch.zeros_like(one), one), strict=True)
+        return torch.stack(offset), torch.stack(slope)
+
+
+def _solve(photos: list[_Photo], kinds: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Fit each model to the photos by least squares. Return values and power (H, N, 3), and errors (H, N).
+
+    Where a photo is clipped, a model may be brighter: its error is one-sided. Were such photos left out, only the dark ones of a shiny
+    metal would be left, and they look like paint. Errors are piecewise quadratic in the values, so Newton's method solves for these.
+    """
+    # Reflectance is at most 1, and the diffuse radiance of paint has no limit.
+    most = torch.tensor([1.0] * kinds + [torch.inf] * (kinds + 1)).view(-1, 1, 1)
+    value, shape = None, (len(most), *photos[0].shown.shape)
+    power, both, rest = (torch.zeros(shape) for _ in range(3))
+    for _ in range(NEWTON_STEPS):
+        for each in power, both, rest:
+            each.zero_()
+        for photo in photos:
+            offset, slope = photo.models()
+            over = photo.shown - offset
+            free = photo.clipped if value is None else photo.clipped & (value * slope > over)
+            counts = photo.weight[:, None] * ~free
+            power += counts * slope.square()
+            both += counts * slope * over
+            rest += counts * over.square()
+        solved = (both / power.clamp_min(1e-12)).clamp_min(0).minimum(most)
+        value = solved if value is None else torch.where(power > 0, solved, value)
+    assert value is not None
+    return value, power, (rest - 2 * value * both + value.square() * power).sum(dim=2)
+
+
+def _fit(photos: list[_Photo], kinds: int, near: Tensor, by_power: bool) -> Fit:
+    """Keep each surfel's best metal and best paint. Errors are added up over the neighbours `near` (N, K).
+
+    With `by_power`, a surfel counts for the mean reflectance by the square of what it mirrors. That is best where the mirrored radiance
+    is known, as that of the object. A lamp's is not, because photos clip it.
+    """
+    value, power, errors = _solve(photos, kinds)
+    square = torch.stack([(photo.weight[:, None] * photo.shown.square()).sum(dim=1) for photo in photos]).sum(dim=0)
+    errors = pooled(torch.cat([errors, TOLERANCE**2 * square[None]]).clamp_min(0).T, near)
+    metal, paint, least = errors.split([kinds, kinds + 1, 1], dim=1)
+    ratio = (metal.amin(dim=1) + least[:, 0]) / (paint.amin(dim=1) + least[:, 0]).clamp_min(1e-12)
+    best = metal.argmin(dim=1)
+    rows = best, torch.arange(len(best))
+    # Sums of the shown and of what white would show, where no channel is clipped, and of weights.
+    whole = torch.zeros(len(best), 7)
+    for photo in photos:
+        (offset, slope), exact = photo.models(), ~photo.clipped.any(dim=1, keepdim=True)
+        columns = exact * (photo.shown - offset[rows]), exact * slope[rows], torch.ones_like(photo.weight)[:, None]
+        whole += photo.weight[:, None] * torch.cat(columns, dim=1)
+    weight = power[rows] if by_power else whole[:, 6:].expand(-1, 3)
+    summed = pooled(torch.cat([value[rows] * weight, weight, whole], dim=1), near)
+    chosen, weight, shown, white, pixels = summed.split([3, 3, 3, 3, 1], dim=1)
+    rough = torch.tensor(ROUGHNESSES)[best]
+    return Fit(ratio.clamp_min(1e-12).log(), chosen / weight.clamp_min(1e-12), rough, pixels[:, 0], shown, white)
 
 
 def fit_both(seen: Seen, mirrored: Iterable[tuple[list[Tensor], Tensor]], near: Tensor) -> Mirrored:
@@ -181,14 +214,13 @@ def fit_both(seen: Seen, mirrored: Iterable[tuple[list[Tensor], Tensor]], near: 
 
     `mirrored` are the yields of `_mirrored`. `near` (N, K) are the neighbours to average over.
     """
-    # The radiance of the object is not blurred, so that one roughness is enough there.
-    everywhere, of_object, radiance, all_met = _Sums(len(near), ROUGHNESSES), _Sums(len(near), ROUGHNESSES[:1]), [], []
+    photos, radiance, all_met = [], [], []
     for view, (lights, met) in enumerate(mirrored):
-        weight, shown = seen.weight[:, view], seen.radiance[:, view]
-        cosine = (seen.normal[:, view] * seen.towards[:, view]).sum(dim=1).clamp(GRAZING, 1)
-        everywhere.add(weight, shown, lights, cosine)
-        of_object.add(weight * met, shown, lights, cosine)
+        photos.append(_Photo.of(seen, view, lights))
         radiance.append(lights[MIDDLE].mean(dim=1))
         all_met.append(met)
+    kinds = len(ROUGHNESSES)
+    # The radiance of the object is not blurred, so that one roughness is enough there.
+    of_object = [photo.part(met, 1) for photo, met in zip(photos, all_met, strict=True)]
     views = (torch.stack(each, dim=1) for each in (radiance, all_met))
-    return Mirrored(everywhere.fit(near, False), of_object.fit(near, True), *views)
+    return Mirrored(_fit(photos, kinds, near, False), _fit(of_object, 1, near, True), *views)

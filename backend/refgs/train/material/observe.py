@@ -64,7 +64,8 @@ class Seen(NamedTuple):
     """Hold what V photos show of each of N surfels, on the CPU.
 
     - `radiance` (N, V, 3): linear, without the photo's exposure
-    - `weight` (N, V): the surfel's blending weights, summed over its pixels; 0 where it is hardly seen, clipped, or at a grazing angle
+    - `clipped` (N, V, 3): bool, where the photo is clipped, so that the surfel has this radiance at least
+    - `weight` (N, V): the surfel's blending weights, summed over its pixels; 0 where it is hardly seen, or at a grazing angle
     - `pixels` (N,): the surfel's blending weights, summed over its pixels in all photos, also where `weight` is 0
     - `mean` (N, 3): the mean radiance over the pixels that are counted in `pixels`
     - `normal` (N, V, 3): the unit normal that is blended at its pixels
@@ -72,11 +73,17 @@ class Seen(NamedTuple):
     """
 
     radiance: Tensor
+    clipped: Tensor
     weight: Tensor
     pixels: Tensor
     mean: Tensor
     normal: Tensor
     towards: Tensor
+
+    @property
+    def exact(self) -> Tensor:
+        """Return `weight` (N, V), but 0 where any channel is clipped."""
+        return self.weight * ~self.clipped.any(dim=2)
 
     @property
     def outward(self) -> Tensor:
@@ -122,23 +129,23 @@ def observe_changes(state: State) -> Observations:
 def observe_mirrored(state: State, inputs: RenderInputs, views: list[int]) -> Seen:
     """Observe the surfels in the training photos `views`, with exposures divided out."""
     sums = [_sums(state, inputs, view) for view in views]
-    radiance, pixels, clipped, normal = torch.stack(sums, dim=1).cpu().split([3, 1, 1, 3], dim=2)
+    radiance, pixels, clipped, normal = torch.stack(sums, dim=1).cpu().split([3, 1, 3, 3], dim=2)
     towards = _towards(inputs.surfels, [state.photo(view) for view in views]).cpu()
-    pixels, clipped = pixels[..., 0], clipped[..., 0]
+    pixels = pixels[..., 0]
     mean = radiance.sum(dim=1) / pixels.sum(dim=1, keepdim=True).clamp_min(1e-6)
     some, normal = pixels.clamp_min(1e-6), torch.nn.functional.normalize(normal, dim=2)
     known = (pixels > LEAST_PIXELS) & ((normal * towards).sum(dim=2) > GRAZING)
-    weight = pixels * (known & (clipped < LEAST_CLIPPED * some))
-    return Seen(radiance / some[..., None], weight, pixels.sum(dim=1), mean, normal, towards)
+    clipped = clipped >= LEAST_CLIPPED * some[..., None]
+    return Seen(radiance / some[..., None], clipped, pixels * known, pixels.sum(dim=1), mean, normal, towards)
 
 
 def _sums(state: State, inputs: RenderInputs, view: int) -> Tensor:
-    """Sum each surfel's pixels (N, 8): linear radiance, weights, clipped weights, and blended normals."""
+    """Sum each surfel's pixels (N, 10): linear radiance, weights, weights of clipped channels, and blended normals."""
     photo, factor = state.photo(view), exposure(state, view)
     radiance = photo.linear if factor is None else photo.linear / factor
     one = torch.ones_like(radiance[..., :1])
-    shown = torch.cat([radiance, one, _clipped(photo), probe.picture(state, view, inputs).normal], dim=-1)
-    features = torch.ones_like(inputs.surfels.positions[:, :1]).expand(-1, 8)
+    shown = torch.cat([radiance, one, photo.clipped.float(), probe.picture(state, view, inputs).normal], dim=-1)
+    features = torch.ones_like(inputs.surfels.positions[:, :1]).expand(-1, 10)
     return pixel_sums(inputs.surfels, photo.camera, state.near, features, lambda _: shown)
 
 

@@ -30,23 +30,23 @@ from refgs.train.material.observe import (
 from refgs.train.state import State, why_not_traced
 
 WEIGHTS = {
-    "fall": 7.89,
-    "fall of changes": 1.27,
-    "light's fall": -2.73,
-    "ratio": 4.58,
-    "reflectance": 9.45,
-    "object's ratio": 1.14,
-    "object's reflectance": 2.21,
-    "tint": 2.58,
-    "grey": 2.02,
-    "changing light": -15.44,
+    "fall": 5.94,
+    "fall of changes": 0.74,
+    "light's fall": -2.42,
+    "ratio": 3.57,
+    "reflectance": 8.28,
+    "object's ratio": 2.04,
+    "object's reflectance": 2.74,
+    "tint": 2.29,
+    "grey": 2.70,
+    "changing light": -33.78,
 }
-BIAS = -7.31
+BIAS = -6.3
 LOW = 0.1  # quantile over the photos
 DARKEST = 1e-4  # radiance: photos tell no darker ones apart
 MOST_FALL, MOST_RATIO, MOST_CHANGE = 2.5, 1.5, 0.4  # terms that are larger tell no more
 ENOUGH_PIXELS = 30.0  # the neighbours' pixels in all photos from which on what they mirror of the object tells
-LEAST_SHOWN = 0.02  # least mean radiance of what a surfel mirrors of the object: in less, errors tell more
+LEAST_SHOWN = 0.02  # least radiance of what ENOUGH_PIXELS mirror of the object, on average: in less, errors tell more
 CHANGES = 0.15  # relative change from which on its colour tells fully
 LIKE = 0.01  # weight of a metal's material if it is only fitted, relative to a learned one
 
@@ -101,8 +101,9 @@ def reckon(state: State) -> Reckoned:
     values = terms(seen, fits, near, shown, changes) | terms_of_changes(state, near)
     every, of_object = fits.everywhere, fits.of_object
     known = (seen.pixels > same_material.FRINGE) & (every.pixels > ENOUGH_PIXELS)
+    known &= pooled(seen.exact.sum(dim=1)[:, None], near)[:, 0] > LEAST_PIXELS
     metal = same_material.spread(graph, log_odds(values), known.float()).sigmoid()
-    by_object = (of_object.pixels > ENOUGH_PIXELS) & (of_object.mirrored > LEAST_SHOWN)
+    by_object = of_object.white.mean(dim=1) > ENOUGH_PIXELS * LEAST_SHOWN
     level = (of_object.reflected / of_object.white.clamp_min(1e-6)).clamp(0, 1)
     reflectance = torch.where(by_object[:, None], level, every.reflectance)
     roughness = torch.where(by_object, of_object.roughness, every.roughness)
@@ -124,7 +125,7 @@ def terms(seen: Seen, fits: mirrored.Mirrored, near: Tensor, shown: Tensor, chan
     `near` (N, K) are neighbours to average over; `shown` and `changes` is what they show (`mean_and_changes`).
 
     - fall: how far the darkest tenth of the photos is below the median, as a logarithm. A metal has no diffuse radiance, so it may be far
-      darker than its median.
+      darker than its median. Clipped photos count: what is brighter than the median does not change it.
     - light's fall: the same of what the surfel mirrors. A metal falls only where that falls.
     - ratio, reflectance: see `mirrored.Fit`, by the light and, as "object's …", by photos in which the surfel mirrors the object
     - tint: whether the radiance changes along the surface's own colour (1), as a coloured metal's, or along grey (0)
@@ -169,8 +170,9 @@ def mean_and_changes(seen: Seen, near: Tensor) -> tuple[Tensor, Tensor]:
 
     The covariance is that of the radiance divided by the brightness of its mean.
     """
-    pixels = pooled(seen.weight, near)
-    shown = pooled(seen.radiance * seen.weight[..., None], near)
+    exact = seen.exact  # clipped highlights look too white
+    pixels = pooled(exact, near)
+    shown = pooled(seen.radiance * exact[..., None], near)
     known = (pixels > LEAST_PIXELS)[..., None]
     count = known.sum(dim=1).clamp_min(1)
     shown = shown / pixels.clamp_min(1e-6)[..., None] * known
