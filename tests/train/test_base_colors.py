@@ -130,17 +130,19 @@ def test_later_metals_keep_their_level_and_learn_patterns(large_ball, tmp_path):
     assert torch.allclose(now[~metal], pattern[~metal], atol=1e-5) and torch.equal(state.learned["environment"], light)
 
 
-def test_neighbouring_paint_is_averaged_but_not_with_metal(large_ball, tmp_path):
+def test_shades_of_paint_are_averaged_but_not_its_pattern_nor_metal(large_ball, tmp_path):
     state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.3, 0.3, 0.3]), every=2)
-    speckled = torch.where(
-        torch.rand(len(metal), 1, generator=torch.Generator().manual_seed(0)) < 0.5, 0.1, 0.3
-    ).expand(-1, 3)
+    chance = torch.rand(len(metal), 2, generator=torch.Generator().manual_seed(0)) < 0.5
+    shade, white = torch.where(chance[:, :1], 0.8, 1.0), chance[:, 1] & ~metal
+    speckled = shade * torch.where(white[:, None], torch.tensor([0.8, 0.8, 0.8]), torch.tensor([0.05, 0.1, 0.3]))
     state.learned["albedo"].data.copy_(torch.where(metal[:, None], 0.9, speckled).logit())
     do(state, "average paint's base colours", 0.3, done=120)
     now = state.surfels().albedo.detach()
     assert torch.allclose(now[metal], torch.tensor(0.9), atol=1e-4)
-    assert float(now[~metal].log().std()) < 0.3 * float(speckled[~metal].log().std())
-    assert float(now[~metal].min()) > 0.1 and float(now[~metal].max()) < 0.3
+    for pattern in white, ~white & ~metal:
+        left, was = now[pattern] / speckled[pattern].mean(dim=0), speckled[pattern] / speckled[pattern].mean(dim=0)
+        assert float(left.log().std()) < 0.5 * float(was.log().std())
+        assert torch.allclose(left.mean(dim=0), torch.ones(3), atol=0.05), "it takes no colour of the other"
 
 
 def test_white_paint_under_dim_lamps_is_darker_under_brighter_lamps(large_ball, tmp_path):

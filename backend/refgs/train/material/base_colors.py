@@ -10,7 +10,7 @@ than few lamps, a thousand dark texels became a little brighter. Six steps preve
   colour for a piece (`same_material`).
 - Metals keep their mean base colour (`level`).
 - What metals mirror of the light is told by them (`told_light`): what lights paint no longer changes it. Only lamps do more for paint.
-- The base colour of paint is averaged over neighbours (`average`), so that the light, not the paint, learns shades.
+- The base colour of paint is averaged over neighbours of like colours (`average`), so that the light, not the paint, learns shades.
 - Lamps have the colour that highlights of paint tell (`told_hue`), and together with paint the brightness that experience tells
   (`_balance`).
 
@@ -34,7 +34,7 @@ from refgs.render.mirrored_light import SIDE
 from refgs.spread import spread
 from refgs.train.learn import light
 from refgs.train.material import same_material
-from refgs.train.material.observe import mean_over, neighbours
+from refgs.train.material.observe import neighbours
 from refgs.train.material.reckoning import Reckoned, principal_axis
 from refgs.train.state import State
 
@@ -43,6 +43,7 @@ DRAWN = 0.3  # part of the way to the told base colour, each time
 LEAST_KNOWN = 0.02  # less spreads from afar
 LEAST_PART = 0.05  # fraction of the metals' pixels from which on what they mirror of the object tells
 AVERAGED = 64  # neighbours
+LIKE = 1.0  # neighbours whose logarithms differ by more have colours of their own
 PAINT = 0.35  # the most that all paint's brightest channel has in the mean; the median of 34 rendered scenes is 0.34
 HUES = 0.13  # standard deviation of the logarithms of a light's hue: Blender's eight HDRIs have this
 LEAST_MIRRORED = 2.0  # pixels that must mirror a texel of the coarse cubemap, so that they tell its radiance
@@ -167,12 +168,18 @@ def _wrong(state: State, metals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 @torch.no_grad()
 def average(state: State, paint: Tensor) -> None:
-    """Average linear base colours of `paint` (N,) over neighbours, so that they reflect as much as before."""
+    """Average linear base colours of `paint` (N,) over neighbours of like colours, so that they reflect as much as before.
+
+    This is a bilateral filter (Tomasi and Manduchi 1998): a shade differs little from its neighbours, and a painted pattern much.
+    """
     if not paint.any():
         return
     raw, near = state.learned["albedo"], neighbours(state.learned["position"], AVERAGED, paint)
-    weight = (paint * state.surfels().opacities)[:, None]
-    raw[paint] = torch.logit(plausible(mean_over(near, raw.sigmoid(), weight)))
+    color = plausible(raw.sigmoid())
+    differs = (color[near].log() - color[paint, None].log()).square().sum(dim=2)
+    weight = (paint * state.surfels().opacities)[near] * (-differs / LIKE**2).exp()
+    mean = (weight[..., None] * color[near]).sum(dim=1) / weight.sum(dim=1, keepdim=True).clamp_min(1e-6)
+    raw[paint] = torch.logit(plausible(mean))
 
 
 def _balance(state: State, logs: Tensor, paint: Tensor, hue: Tensor) -> Tensor:
