@@ -4,8 +4,8 @@ Each capture is a folder of `benchmarks.scenes` under the scene's name, so that 
 or `--paint`: all of it is that. A training of each stops after two thirds. At a tenth, a third, and then, the terms of
 `refgs.train.material.reckoning` are written to DIR. Captures that DIR holds are not trained again.
 
-A logistic regression on the captures before `--show` gives the weights. They are drawn to those in use, which were fitted to other captures.
-The table says how they do on all captures: which part of the surface is wrong, in doubt, and right where it is not in doubt.
+A logistic regression on the captures before `--show` gives the weights, drawn to those in use, which were fitted to other captures. The
+table says how they do on all captures: which part of the surface is wrong, in doubt, and right where it is not in doubt.
 """
 
 import argparse

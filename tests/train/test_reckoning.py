@@ -280,9 +280,10 @@ def test_half_a_mirror_makes_all_of_it_metal(made):
     assert "had been taken for paint" in state.decided["metals"]
 
 
-def test_metals_start_sharp(made):
-    """Check that metals that were learned as rough start over as sharp when they are found, but not at later looks."""
-    show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
+@pytest.mark.parametrize(("metallic", "sharp"), [(6.0, metals.SHARP.metal), (-6.0, metals.SHARP.paint)])
+def test_surfels_start_sharp(made, metallic, sharp):
+    """Check that what was learned as rough starts over as sharp when metals are found, but not at later looks."""
+    show(made, metallic=metallic, roughness=-3.0, albedo=GOLD, lamp=DIM)
     state = made.state
     shown = reckoning.reckon(state).shown
     put(made, roughness=0.0)
@@ -290,7 +291,7 @@ def test_metals_start_sharp(made):
     assert float(state.surfels().roughness.detach()[shown].median()) == pytest.approx(0.5)
     state.part(metals.Metals).found = False
     do(state, "find metals", 0.25)
-    assert float(state.surfels().roughness.detach()[shown].median()) == pytest.approx(metals.SHARP)
+    assert float(state.surfels().roughness.detach()[shown].median()) == pytest.approx(sharp)
 
 
 def test_paint_that_was_taken_for_metal_becomes_paint(made):

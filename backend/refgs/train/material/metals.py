@@ -5,7 +5,6 @@ starts near paint, so it would stay there. So whether a surfel is metal is recko
 at some new meshes. Where photos are sure, metallic values do not learn in between.
 """
 
-import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -23,7 +22,7 @@ GIVEN = Kinds(metal=0.9, paint=0.02)  # metallic that is set where photos are no
 HELD = Kinds(metal=0.98, paint=0.002)  # metallic that does not learn, in the order of `hints.KINDS`
 LIKELY = 1 - questions.DOUBTFUL / 2  # probability of metal, or of paint, from which on metallic is set
 SURE = 0.95  # probability from which on it does not learn
-SHARP = 0.1  # roughness from which metals learn, at most, once they are found
+SHARP = Kinds(metal=0.1, paint=0.2)  # roughness from which surfels learn, at most, once metals are found
 TOLD = 0.005  # a change of a larger fraction of the surface is announced
 
 
@@ -101,9 +100,10 @@ def _judge(state: State, first: bool = False) -> None:
         material = torch.logit(base_colors.plausible(like_metals(found))).to(metallic.device)
         albedo[raised], roughness[raised] = material[raised, :3], material[raised, 3]
     if first:
-        # The first light is blurred. A metal that became rough under it would stay so, while one that is too sharp learns.
+        # The first light is blurred. A surfel that became rough under it would stay so: it spreads a lamp's highlight to where photos show
+        # none, so that it becomes rougher still. One that is too sharp learns.
         fresh = likely > LIKELY
-        roughness[fresh] = roughness[fresh].clamp_max(math.log(SHARP / (1 - SHARP)))
+        roughness.copy_(roughness.minimum(torch.where(fresh, SHARP.metal, SHARP.paint).logit()))
         state.learned.forget("roughness", fresh)
         fresh = _sure_kinds(state)[0] & (shown[:, 3] > 0)
         albedo[fresh] = torch.logit(shown[fresh, :3])

@@ -2,7 +2,7 @@
 
 Each test of the photos is a term, a number for each surfel and its neighbours. The log-odds of metal against paint are a weighted sum of
 terms (a logistic regression), spread over the piece of surface that a surfel belongs to (`same_material`). The weights were fitted to still
-lifes of random shapes, materials and lights, five other scenes and two real captures; docs/notebook/scenes.md names them.
+lifes of random shapes, materials and lights, other scenes, and real captures; docs/notebook/scenes.md names them.
 """
 
 import math
