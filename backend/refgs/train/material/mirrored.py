@@ -41,16 +41,16 @@ class Fit(NamedTuple):
 
     - `ratio` (N,): the logarithm of the squared error as a metal, divided by that as paint
     - `reflectance` (N, 3), `roughness` (N,): values of the metal that fits best; its reflectance is a mean over the neighbours
-    - `pixels` (N,): their pixels in these photos
-    - `reflected`, `white` (N, 3): what they show in all of these photos together, and what a metal of reflectance 1 would show, unless
-      clipped. Where normals err, `reflectance` is too low: surfels mirror other points than their rays meet. Together they mirror the
-      same, so that sums tell more.
+    - `pixels`, `exact` (N,): their pixels in these photos, and those where the photo is not clipped
+    - `reflected`, `white` (N, 3): what these show together, and what a metal of reflectance 1 would show. Where normals err,
+      `reflectance` is too low: surfels mirror other points than their rays meet. Together they mirror the same, so that sums tell more.
     """
 
     ratio: Tensor
     reflectance: Tensor
     roughness: Tensor
     pixels: Tensor
+    exact: Tensor
     reflected: Tensor
     white: Tensor
 
@@ -196,17 +196,18 @@ def _fit(photos: list[_Photo], kinds: int, near: Tensor, by_power: bool) -> Fit:
     ratio = (metal.amin(dim=1) + least[:, 0]) / (paint.amin(dim=1) + least[:, 0]).clamp_min(1e-12)
     best = metal.argmin(dim=1)
     rows = best, torch.arange(len(best))
-    # Sums of the shown and of what white would show, where no channel is clipped, and of weights.
-    whole = torch.zeros(len(best), 7)
+    # Sums of the shown, of what white would show, and of weights, where no channel is clipped, and of all weights.
+    whole = torch.zeros(len(best), 8)
     for photo in photos:
         (offset, slope), exact = photo.models(), ~photo.clipped.any(dim=1, keepdim=True)
-        columns = exact * (photo.shown - offset[rows]), exact * slope[rows], torch.ones_like(photo.weight)[:, None]
+        columns = exact * (photo.shown - offset[rows]), exact * slope[rows], exact, torch.ones_like(exact)
         whole += photo.weight[:, None] * torch.cat(columns, dim=1)
-    weight = power[rows] if by_power else whole[:, 6:].expand(-1, 3)
+    weight = power[rows] if by_power else whole[:, 7:].expand(-1, 3)
     summed = pooled(torch.cat([value[rows] * weight, weight, whole], dim=1), near)
-    chosen, weight, shown, white, pixels = summed.split([3, 3, 3, 3, 1], dim=1)
+    chosen, weight, shown, white, exact, pixels = summed.split([3, 3, 3, 3, 1, 1], dim=1)
     rough = torch.tensor(ROUGHNESSES)[best]
-    return Fit(ratio.clamp_min(1e-12).log(), chosen / weight.clamp_min(1e-12), rough, pixels[:, 0], shown, white)
+    reflectance = chosen / weight.clamp_min(1e-12)
+    return Fit(ratio.clamp_min(1e-12).log(), reflectance, rough, pixels[:, 0], exact[:, 0], shown, white)
 
 
 def fit_both(seen: Seen, mirrored: Iterable[tuple[list[Tensor], Tensor]], near: Tensor) -> Mirrored:

@@ -46,7 +46,7 @@ LOW = 0.1  # quantile over the photos
 DARKEST = 1e-4  # radiance: photos tell no darker ones apart
 MOST_FALL, MOST_RATIO, MOST_CHANGE = 2.5, 1.5, 0.4  # terms that are larger tell no more
 ENOUGH_PIXELS = 30.0  # the neighbours' pixels in all photos from which on what they mirror of the object tells
-LEAST_SHOWN = 0.02  # least radiance of what ENOUGH_PIXELS mirror of the object, on average: in less, errors tell more
+LEAST_SHOWN = 0.02  # least mean radiance of what a surfel mirrors of the object: in less, errors tell more
 CHANGES = 0.15  # relative change from which on its colour tells fully
 LIKE = 0.01  # weight of a metal's material if it is only fitted, relative to a learned one
 
@@ -103,7 +103,7 @@ def reckon(state: State) -> Reckoned:
     known = (seen.pixels > same_material.FRINGE) & (every.pixels > ENOUGH_PIXELS)
     known &= pooled(seen.exact.sum(dim=1)[:, None], near)[:, 0] > LEAST_PIXELS
     metal = same_material.spread(graph, log_odds(values), known.float()).sigmoid()
-    by_object = of_object.white.mean(dim=1) > ENOUGH_PIXELS * LEAST_SHOWN
+    by_object = (of_object.exact > ENOUGH_PIXELS) & (of_object.white.mean(dim=1) > LEAST_SHOWN * of_object.exact)
     level = (of_object.reflected / of_object.white.clamp_min(1e-6)).clamp(0, 1)
     reflectance = torch.where(by_object[:, None], level, every.reflectance)
     roughness = torch.where(by_object, of_object.roughness, every.roughness)
