@@ -176,7 +176,8 @@ def average(state: State, paint: Tensor) -> None:
         return
     raw, near = state.learned["albedo"], neighbours(state.learned["position"], AVERAGED, paint)
     color = plausible(raw.sigmoid())
-    differs = (color[near].log() - color[paint, None].log()).square().sum(dim=2)
+    logs = color.log()
+    differs = (logs[near] - logs[paint, None]).square().sum(dim=2)
     weight = (paint * state.surfels().opacities)[near] * (-differs / LIKE**2).exp()
     mean = (weight[..., None] * color[near]).sum(dim=1) / weight.sum(dim=1, keepdim=True).clamp_min(1e-6)
     raw[paint] = torch.logit(plausible(mean))

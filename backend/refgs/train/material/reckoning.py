@@ -100,8 +100,7 @@ def reckon(state: State) -> Reckoned:
     shown, changes = mean_and_changes(seen, near)
     values = terms(seen, fits, near, shown, changes) | terms_of_changes(state, near)
     every, of_object = fits.everywhere, fits.of_object
-    known = (seen.pixels > same_material.FRINGE) & (every.pixels > ENOUGH_PIXELS)
-    known &= pooled(seen.exact.sum(dim=1)[:, None], near)[:, 0] > LEAST_PIXELS
+    known = (seen.pixels > same_material.FRINGE) & (every.pixels > ENOUGH_PIXELS) & (every.exact > LEAST_PIXELS)
     metal = same_material.spread(graph, log_odds(values), known.float()).sigmoid()
     by_object = (of_object.exact > ENOUGH_PIXELS) & (of_object.white.mean(dim=1) > LEAST_SHOWN * of_object.exact)
     level = (of_object.reflected / of_object.white.clamp_min(1e-6)).clamp(0, 1)
