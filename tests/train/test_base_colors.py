@@ -13,7 +13,7 @@ from tests.makers.pieces import ball_on_board, reckoned
 from tests.makers.training import do, put
 from tests.makers.training import trainer as small
 
-LEVEL, DRAW = "level base colours", "draw metals' base colours"
+LEVEL, DRAW, KEEP = "level base colours", "draw metals' base colours", "keep shades of base colours"
 
 
 def ball(by_object):
@@ -143,6 +143,35 @@ def test_shades_of_paint_are_averaged_but_not_its_pattern_nor_metal(large_ball, 
         left, was = now[pattern] / speckled[pattern].mean(dim=0), speckled[pattern] / speckled[pattern].mean(dim=0)
         assert float(left.log().std()) < 0.5 * float(was.log().std())
         assert torch.allclose(left.mean(dim=0), torch.ones(3), atol=0.05), "it takes no colour of the other"
+
+
+def test_later_shades_of_paint_are_kept_and_patterns_learn(large_ball, tmp_path):
+    """Check paint that has become darker on one side, brighter as a whole, and speckled, since its shades were first kept."""
+    state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.3, 0.3, 0.3]), every=2)
+    do(state, KEEP, 0.7, done=280)
+    side = state.learned["position"].detach()[:, 0]
+    side = (side - side.mean()) / side.std()
+    speckle = torch.where(torch.rand(len(metal), generator=torch.Generator().manual_seed(0)) < 0.5, -0.2, 0.2)
+    shaded = (0.3 * (0.3 * side + speckle + 0.2).exp())[:, None].expand(-1, 3)
+    state.learned["albedo"].data.copy_(torch.where(metal[:, None], 0.9, shaded).logit())
+    do(state, KEEP, 0.7, done=288)
+    now = (state.surfels().albedo.detach()[:, 0] / 0.3).log()[~metal]
+    side, speckle = side[~metal], speckle[~metal]
+    assert abs(float((now * side).mean() / side.square().mean())) < 0.1, "of 0.3"
+    assert float((now * speckle).mean() / speckle.square().mean()) > 0.8
+    assert float(now.mean()) == pytest.approx(0.2, abs=0.05)
+    assert torch.allclose(state.surfels().albedo.detach()[metal], torch.tensor(0.9), atol=1e-4), (
+        "nothing is known of it"
+    )
+
+
+def test_later_shades_of_metals_are_what_they_show(large_ball, tmp_path):
+    state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.3, 0.3, 0.3]))
+    state.learned["shown_color"].data.copy_(torch.tensor([0.9, 0.6, 0.3, 1.0]) * metal[:, None])
+    do(state, KEEP, 0.7, done=280)
+    now = state.surfels().albedo.detach()
+    assert torch.allclose(now[metal], torch.tensor([0.9, 0.6, 0.3]), atol=1e-3)
+    assert torch.allclose(now[~metal], torch.tensor(0.3), atol=1e-4)
 
 
 def test_white_paint_under_dim_lamps_is_darker_under_brighter_lamps(large_ball, tmp_path):

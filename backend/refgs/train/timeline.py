@@ -318,6 +318,7 @@ AFTER = (
     Row("level base colours", every=iterations(10)),
     Row("draw metals' base colours", None, part(0.6), iterations(10)),
     Row("average paint's base colours", None, part(0.6), share(1 / 50)),
+    Row("keep shades of base colours", part(0.6), RESIDUAL, share(1 / 50)),
     Row("prune and divide surfels", setting("densify.start"), None, period("densify.every"), PRUNABLE),
     Row("propagate normals", every=period("propagation.every"), only_if=PROPAGATES, clock="densification"),
     Row("reset opacities", every=period("densify.reset_every"), only_if=RESETS),

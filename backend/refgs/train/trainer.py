@@ -53,6 +53,7 @@ ACTIONS: dict[str, Callable[[State, Step], object]] = {
     "level base colours": metals.level_base_colors,
     "draw metals' base colours": metals.draw_metals,
     "average paint's base colours": metals.average_paint,
+    "keep shades of base colours": metals.keep_shades,
     "prune and divide surfels": densify.prune_and_divide,
     "propagate normals": densify.propagate_normals,
     "reset opacities": densify.reset_opacity,

@@ -10,12 +10,13 @@ than few lamps, a thousand dark texels became a little brighter. Six steps preve
   colour for a piece (`same_material`).
 - Metals keep their mean base colour (`level`).
 - What metals mirror of the light is told by them (`told_light`): what lights paint no longer changes it. Only lamps do more for paint.
-- The base colour of paint is averaged over neighbours of like colours (`average`), so that the light, not the paint, learns shades.
+- The base colour of paint is averaged over neighbours of like colours (`average`), so that the light, not the paint, learns shades. Later,
+  only what is finer than shades learns (`keep_shades`).
 - Lamps have the colour that highlights of paint tell (`told_hue`), and together with paint the brightness that experience tells
   (`_balance`).
 
 All but the first are only done where photos tell the base colour of a metal: elsewhere the light is not known. Metals are drawn and paint
-is averaged until 60 % of the training. Later, only their means are kept: photos add patterns and stains.
+is averaged until 60 % of the training. Later, only their shades and means are kept: photos add patterns and stains.
 """
 
 import math
@@ -43,6 +44,7 @@ DRAWN = 0.3  # part of the way to the told base colour, each time
 LEAST_KNOWN = 0.02  # less spreads from afar
 LEAST_PART = 0.05  # fraction of the metals' pixels from which on what they mirror of the object tells
 AVERAGED = 64  # neighbours
+PASSES = 6  # times that differences are averaged over neighbours, so that shades are left, and no pattern
 LIKE = 1.0  # neighbours whose logarithms differ by more have colours of their own
 PAINT = 0.35  # the most that all paint's brightest channel has in the mean; the median of 34 rendered scenes is 0.34
 HUES = 0.13  # standard deviation of the logarithms of a light's hue: Blender's eight HDRIs have this
@@ -176,11 +178,43 @@ def average(state: State, paint: Tensor) -> None:
         return
     raw, near = state.learned["albedo"], neighbours(state.learned["position"], AVERAGED, paint)
     color = plausible(raw.sigmoid())
-    logs = color.log()
-    differs = (logs[near] - logs[paint, None]).square().sum(dim=2)
-    weight = (paint * state.surfels().opacities)[near] * (-differs / LIKE**2).exp()
-    mean = (weight[..., None] * color[near]).sum(dim=1) / weight.sum(dim=1, keepdim=True).clamp_min(1e-6)
-    raw[paint] = torch.logit(plausible(mean))
+    weight = _alike(color.log(), near, paint, state.surfels().opacities)
+    raw[paint] = torch.logit(plausible((weight[..., None] * color[near]).sum(dim=1)))
+
+
+def _alike(logs: Tensor, near: Tensor, which: Tensor, weight: Tensor) -> Tensor:
+    """Return the weights (M, K) of the neighbours `near` (M, K) of the surfels `which` (N,). Each row sums to 1.
+
+    The more the logarithms of the colours, `logs` (N, 3), differ, the less a neighbour counts. Only neighbours in `which` count, by their
+    `weight` (N,).
+    """
+    differs = (logs[near] - logs[which, None]).square().sum(dim=2)
+    weight = (which * weight)[near] * (-differs / LIKE**2).exp()
+    return weight / weight.sum(dim=1, keepdim=True).clamp_min(1e-6)
+
+
+@torch.no_grad()
+def keep_shades(state: State, metals: Tensor, paint: Tensor) -> None:
+    """Keep shades of base colours: of `metals` (N,) what photos tell, of `paint` (N,) what was learned when this was first done.
+
+    Paint may become darker or brighter as a whole (see `level`). What differs within a few surfels can learn.
+    """
+    raw, (shown, known) = state.learned["albedo"], state.learned["shown_color"].split([3, 1], dim=1)
+    color = plausible(raw.sigmoid())
+    first = paint & (known[:, 0] <= 0)
+    shown[first], known[first] = color[first], 1
+    kept, surfels = plausible(shown).log(), state.surfels()
+    wrong = kept - color.log()
+    for kind in metals & (known[:, 0] > 0), paint:
+        if kind.any():
+            near = neighbours(surfels.positions, AVERAGED, kind)
+            weight = _alike(kept, near, kind, surfels.opacities * known[:, 0])
+            for _ in range(PASSES):
+                wrong[kind] = (weight[..., None] * wrong[near]).sum(dim=1)
+    area = (paint * surfels.opacities * surfels.scales.prod(dim=1))[:, None]
+    wrong[paint] -= (area * wrong).sum(dim=0) / area.sum().clamp_min(1e-30)
+    which = metals | paint
+    raw[which] = torch.logit(plausible((color.log() + known * wrong)[which].exp()))
 
 
 def _balance(state: State, logs: Tensor, paint: Tensor, hue: Tensor) -> Tensor:

@@ -29,9 +29,10 @@ TOLD = 0.005  # a change of a larger fraction of the surface is announced
 class Metals(Part):
     """Remember whether metals have already been `found`.
 
-    Of each surfel, remember whether hints hold its kind (`held`), whether photos are sure of it (`told`), and the base colour that photos
-    tell of it, if it is metal (`shown_color`, see `base_colors.told`). Checkpoints also keep `state.told_light`. It is None unless photos
-    tell base colours of some metals that are sure; without masks, they never do. `hue` (3,) is the light's (`base_colors.told_hue`).
+    Of each surfel, remember whether hints hold its kind (`held`), whether photos are sure of it (`told`), and the base colour that it
+    keeps to (`shown_color`): of metal, what photos tell of it (see `base_colors.told`), and of paint, what it had learned when its shades
+    were first kept. Checkpoints also keep `state.told_light`. It is None unless photos tell base colours of some metals that are sure;
+    without masks, they never do. `hue` (3,) is the light's (`base_colors.told_hue`).
     """
 
     name, saved = "metals", ("found", "hue")
@@ -92,7 +93,7 @@ def _judge(state: State, first: bool = False) -> None:
     state.learned["told"].copy_(metal | paint)
     shown = state.learned["shown_color"]
     sure, painted = (kind.cpu() for kind in _sure_kinds(state))
-    shown.copy_(base_colors.told(found, sure))
+    shown.copy_(base_colors.told(found, sure) * sure[:, None])
     state.part(Metals).hue = base_colors.told_hue(found, painted).to(state.device)
     colored = state.from_hull and bool(shown.any())
     state.told_light = base_colors.told_light(found, sure).to(state.device) if colored else None
@@ -183,6 +184,12 @@ def average_paint(state: State, step: Step) -> None:
     """Average base colours of paint over neighbours, so that the light learns shades, and not the paint."""
     if _base_colors_kept(state):
         base_colors.average(state, _sure_kinds(state)[1])
+
+
+def keep_shades(state: State, step: Step) -> None:
+    """Keep shades of base colours, so that only what is finer learns."""
+    if _base_colors_kept(state):
+        base_colors.keep_shades(state, *_sure_kinds(state))
 
 
 def _base_colors_kept(state: State) -> bool:
