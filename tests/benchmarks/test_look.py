@@ -40,7 +40,8 @@ def made(ball_capture, tmp_path):
     return scene.parent, folder.parent
 
 
-def test_a_run_that_is_the_truth(made, tmp_path):
+def test_a_run_that_is_the_truth(made, tmp_path, monkeypatch):
+    monkeypatch.setattr(look, "VIEWS", 1)  # Eevee in software takes seconds a picture
     scenes, runs = made
     words = ["--scenes", scenes, "--runs", runs, "--out", tmp_path / "out", "--csv", tmp_path / "a.csv"]
     look.main([str(word) for word in words])
