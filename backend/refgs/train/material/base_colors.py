@@ -31,6 +31,7 @@ from refgs.geometry.project import inside, project, sample
 from refgs.geometry.visibility import mirror
 from refgs.model import cubemap
 from refgs.model.environment import CLIPPED
+from refgs.model.surfels import Surfels
 from refgs.render.mirrored_light import SIDE
 from refgs.spread import spread
 from refgs.train.learn import light
@@ -161,11 +162,11 @@ def level(state: State, metals: Tensor, paint: Tensor, hue: Tensor) -> None:
     raw.copy_(torch.where((weight > 0) | paint[:, None], torch.logit(plausible(logs.exp())), raw))
 
 
-def _wrong(state: State, metals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return logarithms of base colours (N, 3), how far `metals` (N,) are from what photos tell, and how much is known of that (N, 1)."""
+def _wrong(state: State, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return logarithms of base colours (N, 3), how far they are from what `which` (N,) keep to, and how much is known of that (N, 1)."""
     color, known = state.learned["shown_color"].split([3, 1], dim=1)
     logs = plausible(state.learned["albedo"].sigmoid()).log()
-    return logs, plausible(color).log() - logs, metals[:, None] * known
+    return logs, plausible(color).log() - logs, which[:, None] * known
 
 
 @torch.no_grad()
@@ -200,21 +201,25 @@ def keep_shades(state: State, metals: Tensor, paint: Tensor) -> None:
     Paint may become darker or brighter as a whole (see `level`). What differs within a few surfels can learn.
     """
     raw, (shown, known) = state.learned["albedo"], state.learned["shown_color"].split([3, 1], dim=1)
-    color = plausible(raw.sigmoid())
     first = paint & (known[:, 0] <= 0)
-    shown[first], known[first] = color[first], 1
-    kept, surfels = plausible(shown).log(), state.surfels()
-    wrong = kept - color.log()
+    shown[first], known[first] = plausible(raw[first].sigmoid()), 1
+    which = metals | paint
+    logs, wrong, weight = _wrong(state, which)
+    kept, surfels = logs + wrong, state.surfels()
     for kind in metals & (known[:, 0] > 0), paint:
         if kind.any():
             near = neighbours(surfels.positions, AVERAGED, kind)
-            weight = _alike(kept, near, kind, surfels.opacities * known[:, 0])
+            alike = _alike(kept, near, kind, surfels.opacities * known[:, 0])
             for _ in range(PASSES):
-                wrong[kind] = (weight[..., None] * wrong[near]).sum(dim=1)
-    area = (paint * surfels.opacities * surfels.scales.prod(dim=1))[:, None]
+                wrong[kind] = (alike[..., None] * wrong[near]).sum(dim=1)
+    area = _area(surfels, paint)[:, None]
     wrong[paint] -= (area * wrong).sum(dim=0) / area.sum().clamp_min(1e-30)
-    which = metals | paint
-    raw[which] = torch.logit(plausible((color.log() + known * wrong)[which].exp()))
+    raw[which] = torch.logit(plausible((logs + weight * wrong)[which].exp()))
+
+
+def _area(surfels: Surfels, which: Tensor) -> Tensor:
+    """Return how much surface each surfel of `which` (N,) covers, up to a factor; 0 elsewhere: (N,)."""
+    return which * surfels.opacities * surfels.scales.prod(dim=1)
 
 
 def _balance(state: State, logs: Tensor, paint: Tensor, hue: Tensor) -> Tensor:
@@ -228,8 +233,7 @@ def _balance(state: State, logs: Tensor, paint: Tensor, hue: Tensor) -> Tensor:
     power = radiance * area.to(radiance).view(-1, 1)
     whole, lamps = power.sum(dim=0), radiance > CLIPPED
     part = (power * lamps).sum(dim=0) / whole
-    surfels = state.surfels()
-    weight = paint * surfels.opacities * surfels.scales.prod(dim=1)
+    weight = _area(state.surfels(), paint)
     mean = (logs.amax(dim=1).exp() * weight).sum() / weight.sum().clamp_min(1e-30)
     wanted = (PAINT / mean.clamp_min(DARKEST)).log().clamp_max(0) + whole.log() - whole.log().mean() - hue
     step = part * (STEP * wanted).clamp(-MOST_STEP, MOST_STEP)

@@ -93,7 +93,7 @@ def _judge(state: State, first: bool = False) -> None:
     state.learned["told"].copy_(metal | paint)
     shown = state.learned["shown_color"]
     sure, painted = (kind.cpu() for kind in _sure_kinds(state))
-    shown.copy_(base_colors.told(found, sure) * sure[:, None])
+    shown.copy_(base_colors.told(found, sure) * sure[:, None])  # paint keeps to its own
     state.part(Metals).hue = base_colors.told_hue(found, painted).to(state.device)
     colored = state.from_hull and bool(shown.any())
     state.told_light = base_colors.told_light(found, sure).to(state.device) if colored else None
