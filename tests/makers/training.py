@@ -1,12 +1,14 @@
 """Make trainings that are short enough for a test, and compare what they learned."""
 
+import copy
+import shutil
 from pathlib import Path
 
 import torch
 
-from refgs.capture import read_capture
+from refgs.capture import Capture, read_capture
 from refgs.run import create_run, open_run
-from refgs.settings import LossSettings, load_settings
+from refgs.settings import LossSettings, RegionSettings, load_settings
 from refgs.train.keep.asset import write_asset
 from refgs.train.state import State
 from refgs.train.timeline import AFTER, BEFORE, Step
@@ -22,6 +24,26 @@ SMALL = [
 TINY = ["surfels.start=600", "surfels.budget=800", "surfels.hull=48", "train.light_first=0"]
 
 
+_read: dict[tuple, Capture] = {}
+
+
+def read(folder: Path, region: RegionSettings) -> Capture:
+    """Read a capture, once as long as its files stay as they are: to find its region takes as long as ten iterations."""
+    files = tuple((file, file.stat().st_mtime_ns) for file in sorted(folder.rglob("*")))
+    key = (files, repr(region))
+    if key not in _read:
+        _read[key] = read_capture(folder, region)
+    return copy.deepcopy(_read[key])
+
+
+def copied(made: Trainer, folder: Path) -> Trainer:
+    """Copy a Trainer and its run folder, to `folder`. A copy takes no time, unlike a new Trainer. It must trace no mesh yet."""
+    shutil.copytree(made.state.folder, folder)
+    new = copy.deepcopy(made)
+    new.state.folder = folder
+    return new
+
+
 def trainer(
     capture, folder, *changes, total=150, preset="quick", report=lambda event, facts: None, device="cpu"
 ) -> Trainer:
@@ -32,7 +54,7 @@ def trainer(
     """
     settings = load_settings(preset, [*SMALL, f"train.iterations={total}", *changes])
     if isinstance(capture, Path):
-        capture = read_capture(capture, settings.region)
+        capture = read(capture, settings.region)
     made = Trainer(capture, settings, folder, report, device=device)
     if not folder.exists():
         create_run(folder, capture, made.state.settings, preset, "cpu", made.state.effective.chosen())

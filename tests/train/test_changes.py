@@ -12,15 +12,20 @@ from refgs.train.material.changing_light import explained
 from refgs.train.material.metals import Metals
 from refgs.train.material.observe import NEIGHBOURS, neighbours, observe_changes
 from tests.makers.lamps import LAMPS, ORANGE, show
-from tests.makers.training import do, put
+from tests.makers.training import copied, do, put
 from tests.makers.training import trainer as small
 
 ALL = ["surfels.sh_degree=0", "needs.specular=on", "needs.outside=off"]
 
 
+@pytest.fixture(scope="module")
+def start(large_ball, tmp_path_factory):
+    return small(large_ball, tmp_path_factory.mktemp("runs") / "start", *ALL, total=400)
+
+
 @pytest.fixture
-def made(large_ball, tmp_path):
-    return small(large_ball, tmp_path / "run", *ALL, total=400)
+def made(start, tmp_path):
+    return copied(start, tmp_path / "run")
 
 
 def change(made):
