@@ -16,6 +16,7 @@ import torch._dynamo  # load Triton's LLVM before Mesa's, which Eevee uses: the 
 
 from benchmarks.scenes.analytic import write_ball_capture
 from refgs.capture import salience
+from refgs.geometry import field
 from refgs.kernels import load
 from tests.makers.emulate import emulate
 from tests.makers.foreign import use_foreign
@@ -69,10 +70,30 @@ def device(request, monkeypatch) -> torch.device:
     return torch.device("cuda" if request.param == "cuda" else "cpu")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def coarse_hollows() -> None:
+    """Look for hollows on a grid of half the side, which takes a second less for each training. Tests of hollows use `fine_hollows`."""
+    field.SIDE //= 2
+
+
+@pytest.fixture
+def fine_hollows(monkeypatch) -> None:
+    """Look for hollows on the grid that trainings use."""
+    monkeypatch.setattr(field, "SIDE", 2 * field.SIDE)
+
+
 @pytest.fixture(scope="session")
 def ball_capture(tmp_path_factory):
-    """Write a small data set of a metal ball: photos of 64 × 64 pixels, cameras, and exact ground truth. Return its folder."""
+    """Write a small data set of a metal ball: photos of 32 × 32 pixels, cameras, and exact ground truth. Return its folder."""
     folder = tmp_path_factory.mktemp("ball")
+    write_ball_capture(folder, 32)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def sharp_ball(tmp_path_factory):
+    """Write the capture of the same ball with photos of 64 × 64 pixels."""
+    folder = tmp_path_factory.mktemp("sharp ball")
     write_ball_capture(folder, 64)
     return folder
 

@@ -19,6 +19,12 @@ from tests.makers.training import check_equal, trainer
 FEW = ["train.checkpoint_every=1000", "needs.specular=on"]
 
 
+@pytest.fixture(scope="module")
+def ball_capture(sharp_ball):
+    """Use sharper photos than other tests, because they are reduced."""
+    return sharp_ball
+
+
 @pytest.fixture
 def large(monkeypatch):
     """Let the objects of small test captures count as large."""
