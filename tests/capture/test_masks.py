@@ -278,11 +278,10 @@ def test_interrupted_call_leaves_the_masks_of_before(tmp_path, monkeypatch):
     assert not (tmp_path / "masks.tmp").exists()
     assert {file: file.read_bytes() for file in (tmp_path / "masks").iterdir()} == files
     # A crash between two files must not make the artist's what is ours.
-    monkeypatch.setattr(making.os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
-    monkeypatch.setattr(making, "write_text", lambda file, text: file.write_text(text))
-    with pytest.raises(OSError, match="disk full"):
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="disk full"):
+        patch.setattr(making.os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+        patch.setattr(making, "write_text", lambda file, text: file.write_text(text))
         make_masks(tmp_path, None, silent)
-    monkeypatch.undo()
     assert make_masks(tmp_path, None, silent)["made"] == COUNT
 
 
