@@ -1,20 +1,24 @@
 """Test that a run becomes an asset with a picture of it, and that other objects stay out of the picture."""
 
+from functools import partial
+
 import bpy
 import numpy as np
 import pytest
 
 from refgs_addon.errors import InputError
+from refgs_addon.scene import asset
 from refgs_addon.scene.asset import SIDE, mark_asset
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.run_parts import cameras
 from tests.makers.captures import look_at
 
 
-def test_the_button_makes_an_asset_whose_picture_shows_the_run_alone(run_folder, addon):
+def test_the_button_makes_an_asset_whose_picture_shows_the_run_alone(run_folder, addon, monkeypatch):
+    monkeypatch.setattr(asset, "render_preview", partial(asset.render_preview, samples=4))
     bpy.ops.refgs.import_run(directory=f"{run_folder}/")
     collection = bpy.data.collections["RefGS pot"]
-    addon.eevee.use_raytracing = False  # much faster in software
+    addon.eevee.use_raytracing = addon.eevee.use_shadows = False  # much faster in software
     camera = next(item for item in cameras(collection).objects if item.name.startswith("front"))
     camera.matrix_world = [*zip(*look_at([1.0, -7.0, 2.5], [1.0, -3.0, 2.0]), strict=True)]
     addon.camera = camera

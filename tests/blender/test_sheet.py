@@ -15,8 +15,15 @@ from refgs_addon.scene.world_light import relight
 from tests.makers.runs import write_panorama
 
 
+@pytest.fixture
+def scene(scene):
+    scene.eevee.use_shadows = False  # no lamps; shadows are most of a frame's time in software
+    return scene
+
+
 def test_a_view_under_each_light(run, scene, tmp_path):
     show(run.collection, "splats")
+    scene.eevee.use_raytracing = False  # much faster in software
     colors = {"red": (1, 0.05, 0.05), "green": (0.05, 1, 0.05), "blue": (0.05, 0.05, 1)}
     for name, color in colors.items():
         write_panorama(tmp_path / f"{name}.exr", np.broadcast_to(color, (8, 16, 3)))
