@@ -1,7 +1,6 @@
 """Start commands to be killed, each in a session of its own, and list what they have left."""
 
 import json
-import multiprocessing
 import os
 import random
 import signal
@@ -16,6 +15,7 @@ from refgs import cli
 from refgs.lock import LOCK
 from tests.makers import processes
 from tests.makers.batches import batch
+from tests.makers.forks import loaded
 from tests.makers.training import TINY
 
 CHANGES = [*TINY, "environment.resolution=16", "train.iterations=30", "train.checkpoint_every=8", "densify.every=10"]
@@ -75,9 +75,7 @@ class Command:
     """
 
     def __init__(self, said: Path, words: list, jobs: tuple[dict, ...] = ()):
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["refgs.train.trainer", "refgs.commands", "refgs.worker", "refgs.export.bake"])
-        self._process = context.Process(target=_parent, args=(said, list(map(str, words)), jobs))
+        self._process = loaded().Process(target=_parent, args=(said, list(map(str, words)), jobs))
         self._process.start()
         self.session = self._process.pid
 
