@@ -33,7 +33,7 @@ from refgs.train.plan import Plan
 from refgs.train.state import why_not_traced
 from refgs.train.timeline import RESET, SEEN, faint_now
 from tests.makers.occluders import as_occluder, plate
-from tests.makers.training import asset_error, check_equal, do, put
+from tests.makers.training import asset_error, check_equal, copied, do, put
 from tests.makers.training import trainer as small
 
 DULL = ["surfels.metallic=0.01", "surfels.roughness=0.8"]  # a matte start, because the trainings are short
@@ -50,6 +50,26 @@ def matte(tmp_path_factory):
     folder = tmp_path_factory.mktemp("matte")
     write_ball_capture(folder, 64, matte=True)
     return folder
+
+
+@pytest.fixture(scope="module")
+def ball_capture(sharp_ball):
+    """Use sharper photos than other tests: what a need is worth is measured in them."""
+    return sharp_ball
+
+
+@pytest.fixture(scope="module")
+def start(ball_capture, tmp_path_factory):
+    """Make a training on the mirror that has not begun. Tests copy it."""
+    return trainer(ball_capture, tmp_path_factory.mktemp("runs") / "start", total=10)
+
+
+@pytest.fixture(scope="module")
+def early(ball_capture, tmp_path_factory):
+    """Train on the mirror until just before its first mesh. Tests copy it."""
+    made = trainer(ball_capture, tmp_path_factory.mktemp("runs") / "early", "surfels.metallic=0.9", total=150)
+    made.run(stop=lambda: made.state.iteration == 99)
+    return made
 
 
 @pytest.fixture(scope="module")
@@ -91,8 +111,8 @@ def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
     assert "iterations" not in forced.state.needs
 
 
-def test_a_convex_mirror_keeps_specular_and_does_without_reflections(ball_capture, tmp_path):
-    made = trainer(ball_capture, tmp_path / "run", "surfels.metallic=0.9", total=150)
+def test_a_convex_mirror_keeps_specular_and_does_without_reflections(early, tmp_path):
+    made = copied(early, tmp_path / "run")
     made.run(stop=lambda: made.state.iteration == 110)
     found = made.state.needs["specular"]
     assert found.needed and found.statistic > 1 and "metallic" in made.state.learned
@@ -166,8 +186,8 @@ def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
     """
     more = [*DULL, "train.checkpoint_every=20", "densify.every=25", "train.light_first=0"]
     whole = trainer(matte, tmp_path / "whole", *more, total=150)
+    first = copied(whole, tmp_path / "cut")
     whole.run()
-    first = trainer(matte, tmp_path / "cut", *more, total=150)
     first.run(stop=lambda: first.state.iteration == 115)
     second = trainer(matte, tmp_path / "cut", *more, total=150)
     second.resume()
@@ -244,13 +264,12 @@ def test_a_matte_scene_is_looked_at_twice(chalk):
     assert not found.needed and found.again < SHINES
 
 
-def test_reflections_by_what_they_could_be_worth(ball_capture, tmp_path):
+def test_reflections_by_what_they_could_be_worth(early, tmp_path):
     """Check when inter-reflection is kept: for a mirror with a fifth of its reflections occluded, but not for a rough black dielectric.
 
     The dielectric reflects so little light that occlusion hardly changes the photos.
     """
-    made = trainer(ball_capture, tmp_path / "run", "surfels.metallic=0.9", total=150)
-    made.run(stop=lambda: made.state.iteration == 99)
+    made = copied(early, tmp_path / "run")
     made.state.occluder = as_occluder(plate(0.5, -1), scale=3.0)  # faces down, above the ball
     do(made.state, "decide on inter-reflection", hidden=0.2)
     found = made.state.needs.pop("reflections")
@@ -261,13 +280,12 @@ def test_reflections_by_what_they_could_be_worth(ball_capture, tmp_path):
 
 
 @pytest.mark.parametrize("hidden", [0.004, 0.2])
-def test_reflections_of_a_small_part_are_kept(ball_capture, tmp_path, hidden):
+def test_reflections_of_a_small_part_are_kept(early, tmp_path, hidden):
     """Keep inter-reflection for a small part that is chrome, below a plate. The rest of the ball is rough, black and dielectric.
 
     `hidden` is below or above the least for the whole object. Without the chrome, inter-reflection is left out.
     """
-    made = trainer(ball_capture, tmp_path / "run", "surfels.metallic=0.9", total=150)
-    made.run(stop=lambda: made.state.iteration == 99)
+    made = copied(early, tmp_path / "run")
     state = made.state
     top = state.learned["position"][:, 2] > 0.97
     for chrome in (True, False):
@@ -285,8 +303,8 @@ def test_reflections_of_a_small_part_are_kept(ball_capture, tmp_path, hidden):
         assert found.threshold == lighting.Reflections.SMALL_PART  # the whole decided nothing
 
 
-def test_views_that_show_the_same_from_the_same_place(ball_capture, tmp_path):
-    made = trainer(ball_capture, tmp_path / "run", total=10)
+def test_views_that_show_the_same_from_the_same_place(start, tmp_path):
+    made = copied(start, tmp_path / "run")
     one = made.state.views[0]
     noise = np.random.default_rng(0).normal(0, 1, one.image.shape)
     again = replace(one, image=(one.image + noise.round()).clip(0, 255).astype(np.uint8))
@@ -301,12 +319,12 @@ def test_views_that_show_the_same_from_the_same_place(ball_capture, tmp_path):
     assert photos.duplicate_views(made.state.views, radius) == []
 
 
-def test_the_part_about_the_mask_is_all_that_counts(ball_capture, tmp_path):
+def test_the_part_about_the_mask_is_all_that_counts(start, tmp_path):
     """Check that a photo cropped to its mask gives the same loss and gradients as the full photo.
 
     Outside the mask, the model renders nothing.
     """
-    made, generator = trainer(ball_capture, tmp_path / "run", total=10), torch.Generator().manual_seed(0)
+    made, generator = copied(start, tmp_path / "run"), torch.Generator().manual_seed(0)
     camera = made.state.photos[0].camera
     camera = replace(camera, fx=0.6 * camera.fx, fy=0.6 * camera.fy)
     mask = (made.state.render(camera).alpha > 0).byte() * 255
@@ -425,12 +443,12 @@ def with_rendering(state, photo, noise=0.0):
     return photo._replace(image=(color.clamp(0, 1) * 255).round().byte(), mask=torch.full_like(photo.mask, 255))
 
 
-def test_specular_on_synthetic_surfels(ball_capture, tmp_path):
+def test_specular_on_synthetic_surfels(start, tmp_path):
     """Check that specular shading gains over 3 dB in photos of a mirror, and under 0.3 dB in photos of a matte ball.
 
     The photos are renderings of the model itself.
     """
-    made = trainer(ball_capture, tmp_path / "run", total=10)
+    made = copied(start, tmp_path / "run")
     light = torch.randn(made.state.learned["environment"].shape, generator=torch.Generator().manual_seed(1))
     for metallic, roughness, least, most in ((5.0, -3.0, 3.0, math.inf), (-20.0, 20.0, -math.inf, 0.3)):
         put(made, metallic=metallic, roughness=roughness)
@@ -442,12 +460,12 @@ def test_specular_on_synthetic_surfels(ball_capture, tmp_path):
 
 
 @pytest.mark.parametrize("mask", [True, False])
-def test_what_a_small_part_loses_is_told_apart(ball_capture, tmp_path, mask):
+def test_what_a_small_part_loses_is_told_apart(start, tmp_path, mask):
     """Check that a patch of surfels, a hundredth of the object's pixels or so, is not hidden by the rest, nor by what is not the object.
 
     The patch turns from black to white. Photos are the model's renderings, with noise that is much larger beyond the mask.
     """
-    made = trainer(ball_capture, tmp_path / "run", total=10)
+    made = copied(start, tmp_path / "run")
     state = made.state
     put(made, albedo=-3.0, opacity=4.0)
     cameras = [state.photo(view).camera for view in probe.spread_views(state)]
@@ -486,12 +504,12 @@ def test_chance_loses_nothing():
     assert abs(lost.whole) < 0.1 and abs(lost.part) < 0.3
 
 
-def test_shares_are_weights(ball_capture, tmp_path):
+def test_shares_are_weights(start, tmp_path):
     """Check `blended_shares`, which sums the blending weights of each surfel over all pixels.
 
     The weights of all surfels add up to the sum of alpha. The weighted mean of a constant map is the constant.
     """
-    made = trainer(ball_capture, tmp_path / "run", total=10)
+    made = copied(start, tmp_path / "run")
     photo, surfels = made.state.photo(0), made.state.surfels()
     alpha = made.state.render(photo.camera).alpha
     shares = blended_shares(surfels, [photo.camera], made.state.near)
