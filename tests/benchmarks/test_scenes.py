@@ -289,7 +289,7 @@ def test_the_passes_show_the_textures(name, tmp_path):
 def test_a_small_part_of_the_pig_is_chrome(tmp_path):
     """Check that the bell takes one to three hundredths of the pixels, in the mean over views, and that nothing else is metal."""
     pytest.importorskip("bpy")
-    run("part", "--out", tmp_path / "part", "--size", SIZE, "--train", 1, "--test", 12, "--samples", 4)
+    run("part", "--out", tmp_path / "part", "--size", SIZE, "--train", 1, "--test", 4, "--samples", 4)
     truth = tmp_path / "part/ground_truth"
     metal, shown = (
         np.stack([read(path)[1] for path in sorted((truth / kind).glob("*.exr"))]) for kind in ("metallic", "alpha")
@@ -335,8 +335,20 @@ def test_every_scene_is_listed():
     assert {path.stem for path in files if "\ndef build()" in path.read_text()} == {*NAMES} - {*STILLS}
 
 
+@pytest.fixture(params=["coarse", pytest.param("as they are", marks=pytest.mark.slow)])
+def cells(request, monkeypatch):
+    """Let scenes sculpt coarse meshes, whose cells are twice as large. The slow tests sculpt them as they are."""
+
+    def coarse(solid, low, high, cell, material):
+        return sculpt(solid, low, high, 2 * cell, material)
+
+    for file in (ROOT / "benchmarks/scenes").glob("*.py"):
+        if request.param == "coarse" and file.stem not in ("solids", "__main__") and " sculpt" in file.read_text():
+            monkeypatch.setattr(f"benchmarks.scenes.{file.stem}.sculpt", coarse, raising=False)
+
+
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in STILLS[3:]])
-def test_meshes_face_outward_and_stand_about_the_origin(name):
+def test_meshes_face_outward_and_stand_about_the_origin(name, cells):
     scene = build(name)
     vertices, triangles, count = scene.mesh.vertices, scene.mesh.triangles, len(scene.mesh.vertices)
     assert np.isfinite(vertices).all()
