@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from refgs.geometry import field
+from refgs.geometry import explain, field, fog
 from refgs.geometry.hollows import carve_hollows
 from tests.makers.distances import around, box, sphere
 from tests.makers.textured import bowl, carve_coarsely, grid, half_ball, photograph
@@ -65,5 +65,7 @@ def test_an_empty_hull_stays_empty():
 
 def test_the_same_seed_carves_the_same(monkeypatch):
     monkeypatch.setattr(field, "SIDE", 32)
+    for module in (fog, explain):
+        monkeypatch.setattr(module, "ITERATIONS", 20)
     photos = [photograph(camera, bowl) for camera in VIEWS]
     np.testing.assert_array_equal(carved_by(photos, half_ball), carved_by(photos, half_ball))

@@ -66,9 +66,11 @@ def depth(camera: Camera, sdf) -> tuple[np.ndarray, np.ndarray]:
     """
     rays = rays_of(camera)
     length = np.linalg.norm(rays, axis=-1)
-    t = np.full(length.shape, 1.0)
+    t, going = np.full(length.shape, 1.0), np.ones(length.shape, bool)
     for _ in range(80):
-        t = t + sdf(camera.position + t[..., None] * rays) / length
+        step = sdf(camera.position + t[going][:, None] * rays[going]) / length[going]
+        t[going] += step
+        going[going] = (np.abs(step) > 1e-9) & (step < 100)  # the others have arrived, or fly away
     hit = np.abs(sdf(camera.position + t[..., None] * rays)) < 1e-3
     return np.where(hit, t, 0).astype(np.float32), hit.astype(np.float32)
 

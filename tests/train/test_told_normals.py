@@ -1,5 +1,6 @@
 """Test that a training draws normals of metals to what outlines tell, and those of rough paint to its mesh."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -34,6 +35,17 @@ def folder(tmp_path_factory):
 def state_of(folder, run, *changes: str):
     settings = Effective.of(load_settings("quick", ["surfels.start=2000", "light.frame=camera", *changes]))
     return set_up(read_capture(folder), settings, run, lambda *_: None, Plan(None), "cpu")
+
+
+@pytest.fixture(scope="module")
+def start(folder, tmp_path_factory):
+    return state_of(folder, tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture
+def state(start):
+    """Copy a training that has not begun: to set one up takes seconds."""
+    return copy.deepcopy(start)
 
 
 def rendered(state, metallic: float, roughness: float = 0.5) -> Step:
@@ -73,21 +85,18 @@ def ball(radius: float) -> Occluder:
     return Occluder(Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
 
 
-def test_metal_is_drawn_to_the_normals_that_outlines_tell(folder, tmp_path):
-    state = state_of(folder, tmp_path)
+def test_metal_is_drawn_to_the_normals_that_outlines_tell(state):
     check_drawn(state, rendered(state, 1.0), state.part(Outlines).told[0], outlines.loss)
 
 
-def test_rough_paint_is_drawn_to_the_normals_of_the_mesh(folder, tmp_path):
-    state = state_of(folder, tmp_path)
+def test_rough_paint_is_drawn_to_the_normals_of_the_mesh(state):
     step = rendered(state, 0.0)
     assert mesh_normals.loss(state, step) is None
     state.occluder = ball(state.capture.radius / 2)
     check_drawn(state, step, state.part(MeshNormals).told(state, state.occluder, 0), mesh_normals.loss)
 
 
-def test_metal_and_glossy_paint_are_not(folder, tmp_path):
-    state = state_of(folder, tmp_path)
+def test_metal_and_glossy_paint_are_not(state):
     state.occluder = ball(state.capture.radius / 2)
     rough, glossy, metal = (
         mesh_normals.loss(state, rendered(state, *material)).item() for material in ((0.0, 0.8), (0.0, 0.1), (1.0, 0.8))
@@ -96,8 +105,7 @@ def test_metal_and_glossy_paint_are_not(folder, tmp_path):
     assert glossy == pytest.approx(rough / 64, rel=1e-4)  # as roughness²
 
 
-def test_a_new_mesh_takes_the_place_of_the_last(folder, tmp_path):
-    state = state_of(folder, tmp_path)
+def test_a_new_mesh_takes_the_place_of_the_last(state):
     state.occluder = ball(state.capture.radius / 2)
     first = state.part(MeshNormals).told(state, state.occluder, 0)
     assert state.part(MeshNormals).told(state, state.occluder, 0) is first
@@ -106,14 +114,12 @@ def test_a_new_mesh_takes_the_place_of_the_last(folder, tmp_path):
     assert (second.plane.norm(dim=1).max() < 0.7 * first.plane.norm(dim=1).max()).item()
 
 
-def test_paint_is_not_drawn_to_outlines(folder, tmp_path):
-    state = state_of(folder, tmp_path)
+def test_paint_is_not_drawn_to_outlines(state):
     paint, metal = (outlines.loss(state, rendered(state, metallic)).item() for metallic in (0.0, 1.0))
     assert paint == 0 and metal > 1e-4
 
 
-def test_a_crop_has_its_part_of_the_loss(folder, tmp_path):
-    state = state_of(folder, tmp_path)
+def test_a_crop_has_its_part_of_the_loss(state):
     whole = rendered(state, 1.0)
     parts = []
     for rows in (slice(0, 50), slice(50, 128)):
