@@ -25,10 +25,10 @@ def trained(tmp_path_factory):
     Both PSNRs are of the first training: just before and just after its inter-reflection starts.
     """
     folder = tmp_path_factory.mktemp("two")
-    write_ball_capture(folder / "capture", 64, TWO)
+    write_ball_capture(folder / "capture", 48, TWO)
     capture, made, heard = read_capture(folder / "capture"), [], []
     for start in (0.3, 1):
-        run = trainer(capture, folder / str(start), *CHANGES, f"indirect.start={start}", total=600)
+        run = trainer(capture, folder / str(start), *CHANGES, f"indirect.start={start}", total=400)
         if start < 1:
             run.run(stop=lambda run=run: run.state.iteration == 199)
             heard.append(held_out_psnr(run.state))
