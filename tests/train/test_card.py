@@ -16,7 +16,7 @@ from refgs.render import raster_cuda, shade
 from refgs.train.learn.light import MirroredLight
 from tests.makers.emulate import emulate
 from tests.makers.occluders import as_occluder
-from tests.makers.training import TINY, trainer
+from tests.makers.training import TINY, copied, trainer
 
 CARD = torch.device("cuda:0")
 # At a metallic of 0.5, a metal and a dielectric are so equally bright that derivatives are only rounding.
@@ -28,9 +28,9 @@ START = [*TINY, "surfels.metallic=0.8"]
 )
 def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
     """Check that training with the CPU's kernels and with emulated CUDA kernels gives nearly the same first three steps."""
-    figures, values = [], []
+    start, figures, values = trainer(ball_capture, tmp_path / "start", *START, *changes, total=3000), [], []
     for name in ("cpu", "card"):
-        made = trainer(ball_capture, tmp_path / name, *START, *changes, total=3000)
+        made = copied(start, tmp_path / name)
         if "indirect.start=0" in changes:
             made.state.occluder = as_occluder(trimesh.creation.torus(1.0, 0.3), scale=made.state.capture.radius)
         if name == "card":

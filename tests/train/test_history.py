@@ -235,7 +235,7 @@ def test_a_truth_that_does_not_fit_is_left_out_with_a_line(known_capture, tmp_pa
         write_exr(file, read_exr(file)[::2])
     made = make(folder, tmp_path / "run", report=lambda *event: said.append(event))
     (warning,) = [facts["what"] for event, facts in said if event == "warning"]
-    assert "does not fit its view of 64×64" in warning
+    assert "does not fit its view of 32×32" in warning
     assert made.measures.errors(made.state).keys() == {"psnr_test"}
 
 

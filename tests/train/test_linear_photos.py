@@ -48,10 +48,10 @@ def test_light_brighter_than_white_is_recovered_from_exr(tmp_path, monkeypatch):
     """Check that a training on EXR photos of a mirror ball finds how much light comes from a lamp, which is 5 times as bright as white."""
     monkeypatch.setattr(analytic, "sky", with_lamp)
     folder = tmp_path / "capture"
-    write_ball_capture(folder, 48)
+    write_ball_capture(folder, 32)
     for split in ("train", "test"):
         for frame in json.loads((folder / f"transforms_{split}.json").read_text())["frames"]:
-            pixels = analytic.photo(np.array(frame["transform_matrix"]), 48, stops=np.log2(EXPOSURE))
+            pixels = analytic.photo(np.array(frame["transform_matrix"]), 32, stops=np.log2(EXPOSURE))
             linear, alpha = srgb_decode(pixels[..., :3]) / EXPOSURE, pixels[..., 3:]
             (folder / f"{frame['file_path']}.png").unlink()
             write_exr(folder / f"{frame['file_path']}.exr", np.dstack([linear * alpha, alpha]))
