@@ -88,7 +88,7 @@ def test_depth_of_any_scale_and_shift_fits(ball, tmp_path, disparity, scale, shi
     camera = state.photos[3].camera
     true = torch.from_numpy(true_maps(camera)[1]).float()
     guessed, counts = priors.at_pixels(*state.part(priors.Priors).depth[3], camera), (true > 0).float()
-    wrong = true + 0.5 * (torch.arange(64) < 20)  # a fifth of the rendering is wrong
+    wrong = true + 0.5 * (torch.arange(true.shape[1]) < 0.3 * true.shape[1])  # a fifth of the rendering is wrong
     found, fits = priors.fitted(guessed, wrong, counts, disparity, 1.0)
     assert fits == 1
     assert float(((found - true).abs() * counts).max()) < 0.05
