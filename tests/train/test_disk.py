@@ -28,19 +28,19 @@ def test_a_disk_that_is_taken_out(ball_capture, tmp_path):
     disk.mkdir()
 
     def take_out(trainer):
-        if trainer.iteration == 50:
+        if trainer.iteration == 25:
             disk.rename(away)
         return False
 
-    words = [*SMALL, "train.iterations=80", "train.checkpoint_every=20"]
+    words = [*SMALL, "train.iterations=40", "train.checkpoint_every=10"]
     with pytest.raises(
         InputError, match=r"run is no longer there: put its disk back, then resume with --resume"
     ) as said:
         train(ball_capture, disk / "run", take_out, *words)
     assert "\n" not in str(said.value)
     away.rename(disk)
-    trainer, _ = train(ball_capture, disk / "run", lambda trainer: trainer.iteration == 41, resume=True)
-    assert trainer.iteration == 41
+    trainer, _ = train(ball_capture, disk / "run", lambda trainer: trainer.iteration == 21, resume=True)
+    assert trainer.iteration == 21
     trainer, _ = train(ball_capture, disk / "run", lambda trainer: False, resume=True)
     assert trainer.ended and (disk / "run" / "splats.ply").exists()
 
@@ -116,7 +116,7 @@ def files(run):
 def test_a_run_on_a_full_disk(ball_capture, small_disk):
     """Check that exports, evaluations, reports and renderings on a full disk fail with one line, and leave the run as it was."""
     run = small_disk / "run"
-    words = ["train.iterations=60", "mesh.resolution=32", "mesh.triangles=500"]
+    words = ["train.iterations=20", "mesh.resolution=32", "mesh.triangles=500"]
     train(ball_capture, run, lambda trainer: False, *SMALL, *words)
     given = [run, None, 64, None, None, True, lambda event, facts: None]
     export(*given)
