@@ -112,7 +112,7 @@ def test_masks_are_made_in_the_box_which_stays_about_the_object(tmp_path):
 
 def test_the_time_for_masks_counts(tmp_path, monkeypatch):
     photograph(tmp_path / "photos")
-    make, spent = masks.with_masks, 8.0
+    make, spent = masks.with_masks, 5.0
 
     def slow(*arguments):
         time.sleep(spent)
@@ -120,10 +120,10 @@ def test_the_time_for_masks_counts(tmp_path, monkeypatch):
 
     monkeypatch.setattr(masks, "with_masks", slow)
     begun = time.perf_counter()
-    train(tmp_path / "photos", tmp_path / "run", minutes=0.4)
+    train(tmp_path / "photos", tmp_path / "run", minutes=0.25)
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert found["total_seconds"] > spent
-    assert time.perf_counter() - begun < 3 * 24  # far from a second 24 seconds besides the masks' on a busy machine
+    assert time.perf_counter() - begun < 3 * 15  # far from a second 15 seconds besides the masks' on a busy machine
 
 
 def test_without_an_object_all_is_trained(tmp_path):

@@ -178,6 +178,7 @@ def test_no_surfel_left_is_said():
         remove_broken(learned)
 
 
+@pytest.mark.slow
 def test_resumed_in_every_stage_it_is_the_same_run():
     found = resumed()
     assert found.finite and found.error == 0

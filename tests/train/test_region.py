@@ -107,7 +107,7 @@ def test_up_turns_the_result_and_nothing_else(ball_capture, tmp_path):
     up = np.array([0.6, 0.0, 0.8])
     folders = [tmp_path / "plain", tmp_path / "turned"]
     for folder, words in zip(folders, ([], [f"region.up={up.tolist()}"]), strict=True):
-        train(ball_capture, folder, "train.iterations=300", "surfels.metallic=0.9", *words)
+        train(ball_capture, folder, "train.iterations=200", "surfels.metallic=0.9", *words)
     plain, turned = map(open_run, folders)
     np.testing.assert_allclose(turned.to_capture[:3, :3] @ (0, 0, 1), up, atol=1e-12)
     assert np.array_equal(plain.to_capture, np.eye(4))
