@@ -10,7 +10,7 @@ from refgs.train.keep import snapshot
 from refgs.train.material import base_colors, metals, reckoning
 from refgs.train.material.observe import neighbours
 from tests.makers.pieces import ball_on_board, reckoned
-from tests.makers.training import do, put
+from tests.makers.training import copied, do, put
 from tests.makers.training import trainer as small
 
 LEVEL, DRAW, KEEP = "level base colours", "draw metals' base colours", "keep shades of base colours"
@@ -24,9 +24,15 @@ def ball(by_object):
     return found._replace(by_object=which, reflected=torch.where(which[:, None], 0.8, 0.1).expand(-1, 3)), metal
 
 
-def metal_and_paint(folder, capture, albedo, every=3):
-    """Make a small training on surfels of `albedo` (N, 3) or (3,), of which photos are sure: one in `every` is paint, the others metal."""
-    made = small(capture, folder, total=400)
+@pytest.fixture(scope="module")
+def start(large_ball, tmp_path_factory):
+    """Make a small training. Tests copy it."""
+    return small(large_ball, tmp_path_factory.mktemp("runs") / "start", total=400)
+
+
+def metal_and_paint(folder, start, albedo, every=3):
+    """Copy a small training with surfels of `albedo` (N, 3) or (3,). Photos are sure that one in `every` is paint, the others metal."""
+    made = copied(start, folder)
     count = made.state.learned.count
     metal = torch.arange(count) % every > 0
     put(made, albedo=albedo.logit(), metallic=torch.where(metal, raw_metallic(0.98), raw_metallic(0.02)), told=True)
@@ -96,10 +102,10 @@ def test_metals_that_mirror_no_object_are_left_alone():
         assert not base_colors.told(found, metal).any()
 
 
-def test_metals_are_drawn_to_what_they_show(large_ball, tmp_path):
+def test_metals_are_drawn_to_what_they_show(start, tmp_path):
     shade = 0.1 + 0.2 * torch.rand(10**4, 3, generator=torch.Generator().manual_seed(0))
-    count = small(large_ball, tmp_path / "count", total=400).state.learned.count
-    state, metal = metal_and_paint(tmp_path / "run", large_ball, shade[:count])
+    count = start.state.learned.count
+    state, metal = metal_and_paint(tmp_path / "run", start, shade[:count])
     unknown = metal & (torch.arange(count) % 2 > 0)
     state.learned["shown_color"].data.copy_(torch.tensor([0.9, 0.6, 0.3, 1.0]) * ~unknown[:, None])
     for _ in range(40):
@@ -109,13 +115,13 @@ def test_metals_are_drawn_to_what_they_show(large_ball, tmp_path):
     assert torch.allclose(now[unknown], shade[:count][unknown], atol=1e-5), "photos tell nothing of these"
 
     snapshot.save(state)
-    again = small(large_ball, tmp_path / "again", total=400).state
+    again = copied(start, tmp_path / "again").state
     snapshot.restore(again, state.folder)
     assert torch.equal(again.learned["shown_color"], state.learned["shown_color"])
 
 
-def test_later_metals_keep_their_level_and_learn_patterns(large_ball, tmp_path):
-    state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.3, 0.3, 0.3]))
+def test_later_metals_keep_their_level_and_learn_patterns(start, tmp_path):
+    state, metal = metal_and_paint(tmp_path / "run", start, torch.tensor([0.3, 0.3, 0.3]))
     pattern = torch.where(torch.arange(len(metal)) % 2 > 0, 0.2, 0.4)[:, None].expand(-1, 3)
     state.learned["albedo"].data.copy_(pattern.logit())
     state.learned["shown_color"].data.copy_(torch.tensor([0.6, 0.6, 0.6, 1.0]).expand(len(metal), 4))
@@ -130,8 +136,8 @@ def test_later_metals_keep_their_level_and_learn_patterns(large_ball, tmp_path):
     assert torch.allclose(now[~metal], pattern[~metal], atol=1e-5) and torch.equal(state.learned["environment"], light)
 
 
-def test_shades_of_paint_are_averaged_but_not_its_pattern_nor_metal(large_ball, tmp_path):
-    state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.3, 0.3, 0.3]), every=2)
+def test_shades_of_paint_are_averaged_but_not_its_pattern_nor_metal(start, tmp_path):
+    state, metal = metal_and_paint(tmp_path / "run", start, torch.tensor([0.3, 0.3, 0.3]), every=2)
     chance = torch.rand(len(metal), 2, generator=torch.Generator().manual_seed(0)) < 0.5
     shade, white = torch.where(chance[:, :1], 0.8, 1.0), chance[:, 1] & ~metal
     speckled = shade * torch.where(white[:, None], torch.tensor([0.8, 0.8, 0.8]), torch.tensor([0.05, 0.1, 0.3]))
@@ -145,9 +151,9 @@ def test_shades_of_paint_are_averaged_but_not_its_pattern_nor_metal(large_ball, 
         assert torch.allclose(left.mean(dim=0), torch.ones(3), atol=0.05), "it takes no colour of the other"
 
 
-def test_later_shades_of_paint_are_kept_and_patterns_learn(large_ball, tmp_path):
+def test_later_shades_of_paint_are_kept_and_patterns_learn(start, tmp_path):
     """Check paint that has become darker on one side, brighter as a whole, and speckled, since its shades were first kept."""
-    state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.3, 0.3, 0.3]), every=2)
+    state, metal = metal_and_paint(tmp_path / "run", start, torch.tensor([0.3, 0.3, 0.3]), every=2)
     do(state, KEEP, 0.7, done=280)
     side = state.learned["position"].detach()[:, 0]
     side = (side - side.mean()) / side.std()
@@ -165,8 +171,8 @@ def test_later_shades_of_paint_are_kept_and_patterns_learn(large_ball, tmp_path)
     )
 
 
-def test_later_shades_of_metals_are_what_they_show(large_ball, tmp_path):
-    state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.3, 0.3, 0.3]))
+def test_later_shades_of_metals_are_what_they_show(start, tmp_path):
+    state, metal = metal_and_paint(tmp_path / "run", start, torch.tensor([0.3, 0.3, 0.3]))
     state.learned["shown_color"].data.copy_(torch.tensor([0.9, 0.6, 0.3, 1.0]) * metal[:, None])
     do(state, KEEP, 0.7, done=280)
     now = state.surfels().albedo.detach()
@@ -174,9 +180,9 @@ def test_later_shades_of_metals_are_what_they_show(large_ball, tmp_path):
     assert torch.allclose(now[~metal], torch.tensor(0.3), atol=1e-4)
 
 
-def test_white_paint_under_dim_lamps_is_darker_under_brighter_lamps(large_ball, tmp_path):
+def test_white_paint_under_dim_lamps_is_darker_under_brighter_lamps(start, tmp_path):
     """Check that paint's base colour times the light's power is kept, in each channel, and that dark walls are left as they are."""
-    state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.9, 0.8, 0.7]), every=2)
+    state, metal = metal_and_paint(tmp_path / "run", start, torch.tensor([0.9, 0.8, 0.7]), every=2)
     light = state.learned["environment"]
     lamps = torch.arange(len(light)) < len(light) // 20
     light.data.copy_(torch.where(lamps[:, None], torch.tensor([8.0, 4.0, 3.0]), 0.1).log())
@@ -195,16 +201,16 @@ def test_white_paint_under_dim_lamps_is_darker_under_brighter_lamps(large_ball, 
     assert power().std() / power().mean() < before.std() / before.mean(), "the light is greyer"
 
 
-def test_a_light_without_lamps_is_kept(large_ball, tmp_path):
-    state, metal = metal_and_paint(tmp_path / "run", large_ball, torch.tensor([0.9, 0.8, 0.7]))
+def test_a_light_without_lamps_is_kept(start, tmp_path):
+    state, metal = metal_and_paint(tmp_path / "run", start, torch.tensor([0.9, 0.8, 0.7]))
     light = state.learned["environment"].detach().fill_(-1.0).clone()
     do(state, LEVEL, 0.3, done=120)
     assert torch.equal(state.learned["environment"], light)
     assert torch.allclose(state.surfels().albedo[~metal], torch.tensor([0.9, 0.8, 0.7]), atol=1e-5)
 
 
-def test_base_colours_stay_below_one(large_ball, tmp_path):
-    made = small(large_ball, tmp_path / "run", total=400)
+def test_base_colours_stay_below_one(start, tmp_path):
+    made = copied(start, tmp_path / "run")
     state = made.state
     put(made, albedo=torch.tensor([20.0, 0.0, -40.0]), metallic=raw_metallic(0.98), told=True)
     metal = torch.ones(state.learned.count, dtype=torch.bool)
@@ -214,9 +220,9 @@ def test_base_colours_stay_below_one(large_ball, tmp_path):
     assert bool(state.learned["albedo"].isfinite().all()) and float(state.surfels().albedo.detach().max()) <= 0.981
 
 
-def test_base_colours_start_at_what_photos_show(large_ball, tmp_path):
+def test_base_colours_start_at_what_photos_show(start, tmp_path):
     """Check that the start's picture, lit by the start's light, is about the photos' mean."""
-    state = small(large_ball, tmp_path / "run", total=400).state
+    state = copied(start, tmp_path / "run").state
     light = state.environment().radiance.mean(dim=0)
     shown = torch.stack(
         [(p.linear * (p.mask[..., None] > 127)).sum(dim=(0, 1)) / (p.mask > 127).sum() for p in state.photos]
