@@ -153,8 +153,8 @@ def test_reference_gradients():
 def test_same_bits_for_any_number_of_threads(private_pool, device, monkeypatch):
     if private_pool:
         monkeypatch.setattr(load, "_openmp", lambda: None)
-    inputs, camera = scenes.surfels("mixed", 16), scenes.camera(150, 100)
-    upstream = [torch.ones(100, 150, 16), torch.ones(100, 150), torch.ones(100, 150)]
+    inputs, camera = scenes.surfels("mixed", 16), scenes.camera(90, 60)
+    upstream = [torch.ones(60, 90, 16), torch.ones(60, 90), torch.ones(60, 90)]
 
     def all_of_it() -> list[Tensor]:
         raster, gradients = run(device, inputs, camera, upstream)
