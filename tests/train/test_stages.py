@@ -64,17 +64,17 @@ def test_the_stage_ends_where_the_preset_says(ball_capture, tmp_path):
 )
 def test_learns_and_renders_as_it_trained(ball_capture, tmp_path, changes):
     changes = ["needs.initial=on", "surfels.metallic=0.9", "train.light_first=50", *changes]
-    made = trained(ball_capture, tmp_path / "run", *changes, total=300)
+    made = trained(ball_capture, tmp_path / "run", *changes, total=200)
     # The bound is lower for mirrors, which have no colour of their own.
     assert held_out_psnr(made.state) > (22 if "reflection=mirror" in changes else 25)
     assert asset_error(made) < 3e-3
 
 
-def test_the_papers_schedule_runs_to_its_end(ball_capture, tmp_path):
+def test_the_papers_schedule_runs_to_its_end(sharp_ball, tmp_path):
     """Check that the preset `paper`, shortened to 300 iterations, trains to its end and gains 4 dB of PSNR on held-out views."""
     changes = ["needs.initial=on", "train.light_first=0", "densify.every=20", "propagation.every=100"]
     changes += ["rates.environment=0.05", "propagation.rest=10", "indirect.every=60", "indirect.resolution=32"]
-    made = trainer(ball_capture, tmp_path / "run", *changes, total=300, preset="paper")
+    made = trainer(sharp_ball, tmp_path / "run", *changes, total=300, preset="paper")
     before = held_out_psnr(made.state)
     made.run()
     assert not made.state.initial and held_out_psnr(made.state) > before + 4
