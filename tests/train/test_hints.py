@@ -24,7 +24,7 @@ from refgs.train.learn.densify import densify
 from refgs.train.material import metals
 from tests.makers.training import TINY, put, trained, trainer
 
-TOTAL = 400
+TOTAL = 300
 METAL, PAINT = (torch.tensor(raw_metallic(metallic)) for metallic in metals.HELD)
 
 
@@ -81,7 +81,7 @@ def test_a_mirror_learned_as_plastic_becomes_metal(plastic, ball_capture, tmp_pa
 
 
 def test_clay_learned_as_rough_metal_becomes_paint(tmp_path):
-    write_ball_capture(tmp_path / "clay", 64, matte=True)
+    write_ball_capture(tmp_path / "clay", 32, matte=True)
     made = trainer(tmp_path / "clay", tmp_path / "run", *TINY, "needs.specular=on", total=150)
     metals.hold_as(made.state, torch.zeros(made.state.learned.count, dtype=torch.long))
     made.run()

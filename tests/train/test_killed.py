@@ -1,5 +1,8 @@
 """Test trainings that stop at a given moment, or cannot write: resumed, they end with the same files as one that was left alone."""
 
+import re
+from itertools import pairwise
+
 import pytest
 
 from refgs import train_job
@@ -34,19 +37,25 @@ def whole(ball_capture, tmp_path_factory):
     return run
 
 
-@pytest.mark.parametrize("name", ["occluder.ply", "needs.json", "splats.ply"])
-def test_a_result_that_could_not_be_written_is_written_by_a_resume(ball_capture, whole, tmp_path, name):
+@pytest.mark.parametrize("names", [("occluder.ply", "needs.json"), ("splats.ply",)])
+def test_results_that_could_not_be_written_are_written_by_a_resume(ball_capture, whole, tmp_path, names):
+    """Put folders, which files cannot replace, where results belong. Remove them in the order of writing, and resume each time."""
     run = tmp_path / "run"
 
-    def block(state):  # a file cannot replace a folder
+    def block(state):
         if state.iteration == state.total - 1:
-            (run / name).unlink(missing_ok=True)
-            (run / name).mkdir()
+            for name in names:
+                (run / name).unlink(missing_ok=True)
+                (run / name).mkdir()
         return False
 
-    with pytest.raises(TryAgain, match="directory"):
+    with pytest.raises(TryAgain, match=rf"{re.escape(names[0])}.*directory"):
         train(ball_capture, run, block)
-    (run / name).rmdir()
+    for name, following in pairwise(names):
+        (run / name).rmdir()
+        with pytest.raises(TryAgain, match=rf"{re.escape(following)}.*directory"):
+            train(ball_capture, run, resume=True)
+    (run / names[-1]).rmdir()
     assert not (run / "splats.ply").exists()
     assert ("stage", "resumed at iteration 30") in train(ball_capture, run, resume=True)
     check_same(run, whole)
