@@ -17,6 +17,7 @@ from refgs.train.keep.measures import held_out_psnr
 from refgs.train.learn.exposures import exposure
 from tests.makers.training import asset_error, trained, trainer
 
+SIZE = 32  # pixels along a photo's side
 METAL = "surfels.metallic=0.9"
 STOPS = (0.0, 0.7, 0.0, -0.7, 0.0)
 
@@ -24,7 +25,7 @@ STOPS = (0.0, 0.7, 0.0, -0.7, 0.0)
 @pytest.fixture(scope="module")
 def turntable(tmp_path_factory):
     folder = tmp_path_factory.mktemp("turntable")
-    write_ball_capture(folder, 48, turning=True)
+    write_ball_capture(folder, SIZE, turning=True)
     return folder
 
 
@@ -53,14 +54,14 @@ def test_auto_tells_which_light_it_was(tmp_path, how, turning):
 
     The answer must also be right for two balls that mirror each other, and for photos of different exposures.
     """
-    write_ball_capture(tmp_path / "capture", 48, turning=turning, **how)
+    write_ball_capture(tmp_path / "capture", SIZE, turning=turning, **how)
     found = trainer(tmp_path / "capture", tmp_path / "run", METAL, total=600).state
     assert found.settings.light.frame == ("camera" if turning else "world"), found.effective.chosen()
     assert "explains" in found.effective.chosen()["light.frame"]
 
 
 def test_without_masks_the_light_stands_still(turntable, tmp_path):
-    write_ball_capture(tmp_path / "bare", 48, turning=True)
+    write_ball_capture(tmp_path / "bare", SIZE, turning=True)
     for file in (tmp_path / "bare").glob("*/*.png"):
         Image.open(file).convert("RGB").save(file)
     said = []
@@ -77,9 +78,9 @@ def test_a_light_that_turns_is_recovered(turntable, tmp_path):
 
     Check also that the saved run renders as the training did, and that run.toml records which light was chosen.
     """
-    still = trainer(turntable, tmp_path / "still", METAL, "light.frame=world", "light.exposure=off", total=300)
+    still = trainer(turntable, tmp_path / "still", METAL, "light.frame=world", "light.exposure=off", total=200)
     still.run()
-    turning = trained(turntable, tmp_path / "run", METAL, "light.exposure=off", total=300)
+    turning = trained(turntable, tmp_path / "run", METAL, "light.exposure=off", total=200)
     assert held_out_psnr(turning.state) > held_out_psnr(still.state) + 3
 
     run = open_run(turning.state.folder)
@@ -142,7 +143,7 @@ def test_white_balances_are_learned_where_photos_differ(tmp_path):
 
 def test_exposures_cost_nothing_where_photos_agree(ball_capture, tmp_path):
     without, asked = (
-        trained(ball_capture, tmp_path / e, METAL, f"light.exposure={e}", total=300) for e in ("off", "auto")
+        trained(ball_capture, tmp_path / e, METAL, f"light.exposure={e}", total=200) for e in ("off", "auto")
     )
     assert "exposure" not in asked.state.learned and "no exposures of their own" in asked.state.decided["exposures"]
     assert abs(held_out_psnr(asked.state) - held_out_psnr(without.state)) < 0.3
