@@ -1,5 +1,6 @@
 """Test the command line's door: help and wrong arguments without importing torch, exit statuses whatever the system lacks."""
 
+import json
 import os
 import subprocess
 import sys
@@ -14,19 +15,47 @@ from refgs.settings import load_settings
 HELP, WRONG = 0, 2
 
 
-def refgs(tmp_path, *words) -> tuple[int, str, set[str]]:
-    """Run the command `refgs` with these arguments. Return its exit status, its output, and the slow packages that it imported.
+PROGRAM = """
+import json, os, sys
+from refgs.cli import main
+for line in sys.stdin:
+    folder, words = json.loads(line)
+    if (child := os.fork()) == 0:
+        os.chdir(folder)
+        sys.argv[1:], said, status = words, os.open("said", os.O_WRONLY | os.O_CREAT), 0
+        for stream in (1, 2):
+            os.dup2(said, stream)
+        try:
+            main()
+        except SystemExit as ended:
+            status = ended.code or 0
+        print(*({"torch", "scipy", "trimesh"} & set(sys.modules)), file=open("imported", "w"), flush=True)
+        sys.stdout.flush(), sys.stderr.flush()
+        os._exit(status)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
 
-    Slow packages are torch, scipy and trimesh.
+
+@pytest.fixture(scope="module")
+def refgs():
+    """Start a process that forks for each command, because to load `refgs` takes longer than its answers.
+
+    Yields a function that runs a command in a folder. It returns the exit status, the output, and the slow packages that the command
+    imported: torch, scipy and trimesh.
     """
-    program = (
-        "import sys\n"
-        "from refgs.cli import main\n"
-        "try:\n    main()\n"
-        "finally:\n    print(*({'torch', 'scipy', 'trimesh'} & set(sys.modules)), file=open('imported', 'w'))"
-    )
-    done = subprocess.run([sys.executable, "-c", program, *words], cwd=tmp_path, capture_output=True, text=True)
-    return done.returncode, done.stdout + done.stderr, set((tmp_path / "imported").read_text().split())
+    if not hasattr(os, "fork"):
+        pytest.skip("needs fork")
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", PROGRAM], stdin=pipe, stdout=pipe, text=True) as process:
+
+        def run(folder, *words) -> tuple[int, str, set[str]]:
+            process.stdin.write(json.dumps([str(folder), words]) + "\n")
+            process.stdin.flush()
+            status = int(process.stdout.readline())
+            return status, (folder / "said").read_text(), set((folder / "imported").read_text().split())
+
+        yield run
+        process.stdin.close()
 
 
 @pytest.mark.parametrize(
@@ -67,7 +96,7 @@ def refgs(tmp_path, *words) -> tuple[int, str, set[str]]:
         (WRONG, "bench nonsense", "no benchmark 'nonsense'"),
     ],
 )
-def test_torch_is_not_imported(tmp_path, status, words, says):
+def test_torch_is_not_imported(refgs, tmp_path, status, words, says):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").touch()
     (tmp_path / "stopped").mkdir()

@@ -335,18 +335,6 @@ def test_every_scene_is_listed():
     assert {path.stem for path in files if "\ndef build()" in path.read_text()} == {*NAMES} - {*STILLS}
 
 
-@pytest.fixture(params=["coarse", pytest.param("as they are", marks=pytest.mark.slow)])
-def cells(request, monkeypatch):
-    """Let scenes sculpt coarse meshes, whose cells are twice as large. The slow tests sculpt them as they are."""
-
-    def coarse(solid, low, high, cell, material):
-        return sculpt(solid, low, high, 2 * cell, material)
-
-    for file in (ROOT / "benchmarks/scenes").glob("*.py"):
-        if request.param == "coarse" and file.stem not in ("solids", "__main__") and " sculpt" in file.read_text():
-            monkeypatch.setattr(f"benchmarks.scenes.{file.stem}.sculpt", coarse, raising=False)
-
-
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in STILLS[3:]])
 def test_meshes_face_outward_and_stand_about_the_origin(name, cells):
     scene = build(name)

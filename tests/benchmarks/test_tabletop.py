@@ -93,7 +93,7 @@ def test_what_stands_before_the_object_is_not_in_its_mask(tmp_path):
 
 
 @pytest.mark.parametrize("name", tabletop.SCENES)
-def test_objects_stand_before_the_cameras_within_the_room(name):
+def test_objects_stand_before_the_cameras_within_the_room(name, cells):
     still = tabletop.SCENES[name]()
     corners = np.array([solid(part).bounds for part in still.object])
     assert corners[:, 0, 2] == pytest.approx(FLOOR), "an object floats"

@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 
-from benchmarks import floors, gpu, kernels, machine
+from benchmarks import floors, gpu, iteration, kernels, machine
 from benchmarks.harness import Bench
 
 CPU = torch.device("cpu")
@@ -17,8 +17,10 @@ def bench():
     return Bench("gpu", ArgumentParser(), [])
 
 
-def test_the_cards_benchmark_runs(bench, capsys):
-    """Run the GPU benchmark on the CPU, without its trainings."""
+def test_the_cards_benchmark_runs(bench, capsys, monkeypatch):
+    """Run the GPU benchmark on the CPU, without its trainings, on a smaller scene."""
+    monkeypatch.setattr(iteration, "SIZE", 32)
+    monkeypatch.setattr(iteration, "SURFELS", 600)
     gpu.measure_raster(bench, CPU, [(500, 60, 40)], rounds=2)
     gpu.measure_frames(bench, CPU, 500, 40, rounds=2)
     gpu.measure_iteration(bench, CPU, rounds=1)
