@@ -13,10 +13,10 @@ SIDE = 40
 
 
 @pytest.fixture
-def views(ball_capture, monkeypatch):
+def views(sharp_ball, monkeypatch):
     """Return the views of a small capture, which then counts as large."""
     monkeypatch.setattr(cached, "LARGE", 0)
-    return read_capture(ball_capture).views[:6]
+    return read_capture(sharp_ball).views[:6]
 
 
 def mapped(array: np.ndarray) -> bool:
@@ -122,13 +122,13 @@ def test_mapped_photos_leave_the_processs_memory_and_come_back(views, tmp_path):
     assert before - mapped_bytes() > 30e6
 
 
-def test_few_photos_stay_in_memory(ball_capture, tmp_path):
-    loaded = load_views(read_capture(ball_capture).views[:2], SIDE, tmp_path / "photos")
+def test_few_photos_stay_in_memory(sharp_ball, tmp_path):
+    loaded = load_views(read_capture(sharp_ball).views[:2], SIDE, tmp_path / "photos")
     assert not mapped(loaded[0].image) and not (tmp_path / "photos").exists()
 
 
-def test_reduced_views_are_as_if_loaded_smaller(ball_capture, tmp_path):
-    views = read_capture(ball_capture).views[:4]
+def test_reduced_views_are_as_if_loaded_smaller(sharp_ball, tmp_path):
+    views = read_capture(sharp_ball).views[:4]
     whole = [load_view(view, 64) for view in views]
     for view, small in zip(views, reduced_views(whole, 2, tmp_path / "photos"), strict=True):
         wanted = load_view(view, 32)

@@ -52,8 +52,8 @@ def write_truth(folder, run, views):
 
 
 @pytest.fixture(scope="module")
-def made(ball_capture, tmp_path_factory):
-    folder, capture = tmp_path_factory.mktemp("evaluate"), read_capture(ball_capture)
+def made(sharp_ball, tmp_path_factory):
+    folder, capture = tmp_path_factory.mktemp("evaluate"), read_capture(sharp_ball)
     run, views = write_run(folder / "run", capture), capture.test_views
     return run, write_truth(folder / "truth", open_run(run), views), views
 
