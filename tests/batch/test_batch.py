@@ -28,7 +28,7 @@ from tests.makers.training import TINY
 
 pytest.importorskip("ray")
 pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self"), reason="needs /proc")
-CHANGES = [*TINY, "environment.resolution=16", "train.iterations=5000", "indirect.start=0.9"]
+CHANGES = [*TINY, "environment.resolution=16", "train.iterations=1500", "indirect.start=0.9", "indirect.resolution=48"]
 CHANGES += ["mesh.resolution=32", "mesh.triangles=500", "mesh.texture=64"]
 
 
