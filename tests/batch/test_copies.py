@@ -29,9 +29,10 @@ RAY = str(Path(sys.executable).with_name("ray"))
 CHANGES = [
     *TINY,
     "environment.resolution=16",
-    "train.iterations=5000",
+    "train.iterations=1500",
     "indirect.start=0.9",
-    "train.checkpoint_every=300",
+    "indirect.resolution=48",
+    "train.checkpoint_every=100",
 ]
 CHANGES += ["mesh.resolution=32", "mesh.triangles=500", "mesh.texture=64"]
 HIDE = 'mount -t tmpfs none "$0" && exec "$@"'
