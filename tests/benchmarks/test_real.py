@@ -6,6 +6,8 @@ import pytest
 import trimesh
 
 from benchmarks import harness, real
+from refgs import cli
+from refgs.capture import silhouettes
 from refgs.errors import InputError
 from tests.makers.captures import nerfstudio
 
@@ -18,13 +20,28 @@ hull = 48
 [train]
 iterations = 40
 light_first = 0
+[indirect]
+resolution = 48
 [mesh]
 resolution = 48
 texture = 64
 """
 
 
-def test_captures_are_trained_and_shown_on_a_page(tmp_path, capsys):
+@pytest.fixture
+def quick(monkeypatch):
+    """Train and evaluate in this process, which has loaded torch, and make coarse masks."""
+
+    def call(*words):
+        cli.app([*map(str, words)], standalone_mode=False)
+        return 0
+
+    monkeypatch.setattr(harness, "call", call)
+    monkeypatch.setattr(silhouettes, "GRID", 24)
+    monkeypatch.setattr(silhouettes, "ROUNDS", 3)
+
+
+def test_captures_are_trained_and_shown_on_a_page(quick, tmp_path, capsys):
     nerfstudio(tmp_path / "captures" / "ball")
     (tmp_path / "captures" / "notes").mkdir()
     (tmp_path / "small.toml").write_text(SMALL)
