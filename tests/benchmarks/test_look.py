@@ -53,4 +53,4 @@ def test_a_run_that_is_the_truth(made, tmp_path, monkeypatch):
         assert found[look.RENDERER, f"{light}_specks"] == 0
     assert all(found[drawn, "milliseconds"] > 0 for drawn in DRAWN)
     height, width = cv2.imread(str(tmp_path / "out" / "ball.png")).shape[:2]
-    assert (height, width) == (2 * look.VIEWS * 64, 5 * 64)
+    assert (height, width) == (2 * look.VIEWS * 32, 5 * 32)
