@@ -11,11 +11,11 @@ from tests.makers.training import trainer
 MANY = ["surfels.start=100", "surfels.budget=100000"]
 
 
-def test_the_area_is_that_of_the_masks_and_at_most_that_of_the_region(ball_capture, tmp_path):
-    size = object_size(trainer(ball_capture, tmp_path / "run").state)
+def test_the_area_is_that_of_the_masks_and_at_most_that_of_the_region(sharp_ball, tmp_path):
+    size = object_size(trainer(sharp_ball, tmp_path / "run").state)
     assert size.area == pytest.approx(math.pi / 4 * size.span**2, rel=0.05)  # a ball
     region = ["region.centre=[0.0,0.0,0.9]", "region.size=[0.2,0.2,0.2]"]
-    assert 0 < object_size(trainer(ball_capture, tmp_path / "part", *region).state).area < size.area / 4
+    assert 0 < object_size(trainer(sharp_ball, tmp_path / "part", *region).state).area < size.area / 4
 
 
 def test_a_larger_object_gets_more_surfels_within_limits():
@@ -24,8 +24,8 @@ def test_a_larger_object_gets_more_surfels_within_limits():
     assert surfel_budget(load_settings("standard", ["surfels.density=0", *MANY]).surfels, 300) == 100000
 
 
-def test_the_budget_and_its_reason_are_recorded(ball_capture, tmp_path):
-    state = trainer(ball_capture, tmp_path / "run", *MANY, "surfels.density=0.5").state
+def test_the_budget_and_its_reason_are_recorded(sharp_ball, tmp_path):
+    state = trainer(sharp_ball, tmp_path / "run", *MANY, "surfels.density=0.5").state
     area = object_size(state).area
     assert state.settings.surfels.budget == round(area / 2) < 100000
     assert f"{area:,.0f} pixels" in state.effective.changes["surfels.budget"].why
