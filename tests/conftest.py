@@ -72,14 +72,8 @@ def device(request, monkeypatch) -> torch.device:
 
 @pytest.fixture(scope="session", autouse=True)
 def coarse_hollows() -> None:
-    """Look for hollows on a grid of half the side, which takes a second less for each training. Tests of hollows use `fine_hollows`."""
+    """Look for hollows on a grid of half the side, which takes a second less for each training. Tests of hollows have grids of their own."""
     field.SIDE //= 2
-
-
-@pytest.fixture
-def fine_hollows(monkeypatch) -> None:
-    """Look for hollows on the grid that trainings use."""
-    monkeypatch.setattr(field, "SIDE", 2 * field.SIDE)
 
 
 @pytest.fixture(scope="session")
