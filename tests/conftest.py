@@ -72,7 +72,7 @@ def device(request, monkeypatch) -> torch.device:
 
 @pytest.fixture(scope="session", autouse=True)
 def coarse_hollows() -> None:
-    """Look for hollows on a grid of half the side, which takes a second less for each training. Tests of hollows have grids of their own."""
+    """Look for hollows on a grid of half the side: each training takes a second less. Tests of hollows have grids of their own."""
     field.SIDE //= 2
 
 

@@ -1,5 +1,7 @@
 """Test that base colours start at what photos show, and are kept at what photos and experience tell."""
 
+import math
+
 import pytest
 import torch
 
@@ -8,6 +10,7 @@ from refgs.model.surfels import raw_metallic
 from refgs.render.mirrored_light import SIDE
 from refgs.train.keep import snapshot
 from refgs.train.material import base_colors, metals, reckoning
+from refgs.train.material.highlights import Told
 from refgs.train.material.observe import neighbours
 from tests.makers.pieces import ball_on_board, reckoned
 from tests.makers.training import copied, do, put
@@ -192,13 +195,32 @@ def test_white_paint_under_dim_lamps_is_darker_under_brighter_lamps(start, tmp_p
         return (light.detach().exp() * area).sum(dim=0)
 
     before, colour = power(), state.surfels().albedo.detach()[~metal].mean(dim=0)
+    state.part(metals.Metals).mean = torch.tensor(0.35).log()
     for _ in range(60):
         do(state, LEVEL, 0.3, done=120)
     now = state.surfels().albedo.detach()[~metal].mean(dim=0)
     assert torch.allclose(now * power(), colour * before, rtol=1e-3)
     assert torch.allclose(light.detach()[~lamps].exp(), torch.tensor(0.1))
-    assert float(now.max()) < base_colors.PAINT + 0.02
+    assert float(now.max()) == pytest.approx(0.35, abs=0.02)
     assert power().std() / power().mean() < before.std() / before.mean(), "the light is greyer"
+
+
+def test_highlights_outweigh_what_paint_usually_is(start, tmp_path):
+    """Check to which mean grey paint of 0.6 is drawn: downward by experience alone, and as highlights tell, the more they are sure."""
+    state, metal = metal_and_paint(tmp_path / "run", start, torch.tensor([0.6, 0.6, 0.6]))
+
+    def wanted(told, before=None):
+        return float(base_colors.wanted(state, ~metal, told, before).exp())
+
+    assert base_colors.PAINT < wanted(None) < 0.6
+    brighter, darker = Told(-0.2, 0.02), Told(0.2, 0.02)
+    assert wanted(darker) < 0.6 < wanted(brighter)
+    assert wanted(Told(-0.2, 1e6)) == pytest.approx(wanted(None), rel=1e-3)
+    lower = torch.tensor(0.5).log()
+    assert wanted(darker, lower) < 0.5, "photos have drawn it back"
+    assert wanted(Told(3.0, 0.02), lower) == pytest.approx(0.6 * math.exp(-base_colors.FARTHEST), rel=1e-3)
+    state.learned["albedo"].data.fill_(-2.2)
+    assert wanted(None) == pytest.approx(0.1, rel=0.01), "dark paint is left alone"
 
 
 def test_a_light_without_lamps_is_kept(start, tmp_path):
@@ -215,7 +237,7 @@ def test_base_colours_stay_below_one(start, tmp_path):
     put(made, albedo=torch.tensor([20.0, 0.0, -40.0]), metallic=raw_metallic(0.98), told=True)
     metal = torch.ones(state.learned.count, dtype=torch.bool)
     state.learned["shown_color"].data.fill_(1.0)
-    base_colors.level(state, metal, ~metal, torch.zeros(3))
+    base_colors.level(state, metal, ~metal, torch.zeros(3), torch.tensor(0.3).log())
     base_colors.draw(state, metal)
     assert bool(state.learned["albedo"].isfinite().all()) and float(state.surfels().albedo.detach().max()) <= 0.981
 

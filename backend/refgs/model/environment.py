@@ -1,5 +1,6 @@
 """Represent distant light by a cubemap of linear HDR radiance, prefiltered for specular reflection (split sum) and for irradiance."""
 
+import copy
 import math
 
 import numpy as np
@@ -54,6 +55,13 @@ class Environment:
     def turn(self, camera: Camera) -> np.ndarray:
         """Return the rotation (3, 3) from world directions to those in which `radiance` is stored."""
         return np.eye(3) if self.reference is None else turn_between(camera, self.reference)
+
+    def without_reflections(self) -> "Environment":
+        """Return the light as it reaches matte surfaces: with the same irradiance, and nothing to mirror."""
+        matte = copy.copy(self)
+        matte.levels = self.levels.clone()
+        matte.levels[: -6 * self.sides[-1] ** 2] = 0  # irradiance is the last level
+        return matte
 
     def reduced(self, side: int) -> "Environment":
         """Return the light with a cubemap of `side` texels along a side."""

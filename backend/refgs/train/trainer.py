@@ -51,6 +51,7 @@ ACTIONS: dict[str, Callable[[State, Step], object]] = {
     "judge metals": metals.judge,
     "even coloured metal out": even_metal.even_out,
     "level base colours": metals.level_base_colors,
+    "compare highlights": metals.compare_highlights,
     "draw metals' base colours": metals.draw_metals,
     "average paint's base colours": metals.average_paint,
     "keep shades of base colours": metals.keep_shades,

@@ -12,8 +12,8 @@ than few lamps, a thousand dark texels became a little brighter. Six steps preve
 - What metals mirror of the light is told by them (`told_light`): what lights paint no longer changes it. Only lamps do more for paint.
 - The base colour of paint is averaged over neighbours of like colours (`average`), so that the light, not the paint, learns shades. Later,
   only what is finer than shades learns (`keep_shades`).
-- Lamps have the colour that highlights of paint tell (`told_hue`), and together with paint the brightness that experience tells
-  (`_balance`).
+- Lamps have the colour that highlights of paint tell (`told_hue`). Together with paint they have the brightness that highlights
+  (`highlights.py`) and experience tell (`wanted`).
 
 All but the first are only done where photos tell the base colour of a metal: elsewhere the light is not known. Metals are drawn and paint
 is averaged until 60 % of the training. Later, only their shades and means are kept: photos add patterns and stains.
@@ -36,6 +36,7 @@ from refgs.render.mirrored_light import SIDE
 from refgs.spread import spread
 from refgs.train.learn import light
 from refgs.train.material import same_material
+from refgs.train.material.highlights import Told
 from refgs.train.material.observe import neighbours
 from refgs.train.material.reckoning import Reckoned, principal_axis
 from refgs.train.state import State
@@ -47,10 +48,13 @@ LEAST_PART = 0.05  # fraction of the metals' pixels from which on what they mirr
 AVERAGED = 64  # neighbours
 PASSES = 6  # times that differences are averaged over neighbours, so that shades are left, and no pattern
 LIKE = 1.0  # neighbours whose logarithms differ by more have colours of their own
-PAINT = 0.35  # the most that all paint's brightest channel has in the mean; the median of 34 rendered scenes is 0.34
+PAINT = 0.34  # all paint's brightest channel in the mean, as far as highlights do not tell, at most: the median of 34 rendered scenes
+PAINTS = 0.66  # standard deviation of its natural logarithm in 21 rendered scenes
 HUES = 0.13  # standard deviation of the logarithms of a light's hue: Blender's eight HDRIs have this
 LEAST_MIRRORED = 2.0  # pixels that must mirror a texel of the coarse cubemap, so that they tell its radiance
-STEP, MOST_STEP = 0.1, 0.05  # part of the way to balance, each time, and the largest step: logarithms
+STEP, MOST_STEP = 0.3, 0.1  # part of the way to balance, each time, and the largest step: logarithms
+TOWARDS = 0.4  # part of the way to what highlights tell, each time that they are compared
+FARTHEST = 0.3  # logarithm, from paint's mean to the one that it is drawn to
 
 
 def plausible(color: Tensor) -> Tensor:
@@ -150,15 +154,15 @@ def draw(state: State, metals: Tensor) -> None:
 
 
 @torch.no_grad()
-def level(state: State, metals: Tensor, paint: Tensor, hue: Tensor) -> None:
+def level(state: State, metals: Tensor, paint: Tensor, hue: Tensor, mean: Tensor | None) -> None:
     """Keep the mean base colour of `metals` (N,) at what photos tell, and balance lamps with `paint` (N,) (see `_balance`).
 
     Differences between base colours can learn.
     """
     raw = state.learned["albedo"]
     logs, wrong, weight = _wrong(state, metals)
-    mean = (weight * wrong).sum(dim=0) / weight.sum().clamp_min(1e-6)
-    logs = logs + torch.where(weight > 0, mean, 0) + paint[:, None] * _balance(state, logs, paint, hue)
+    off = (weight * wrong).sum(dim=0) / weight.sum().clamp_min(1e-6)
+    logs = logs + torch.where(weight > 0, off, 0) + paint[:, None] * _balance(state, logs, paint, hue, mean)
     raw.copy_(torch.where((weight > 0) | paint[:, None], torch.logit(plausible(logs.exp())), raw))
 
 
@@ -222,21 +226,44 @@ def _area(surfels: Surfels, which: Tensor) -> Tensor:
     return which * surfels.opacities * surfels.scales.prod(dim=1)
 
 
-def _balance(state: State, logs: Tensor, paint: Tensor, hue: Tensor) -> Tensor:
+@torch.no_grad()
+def wanted(state: State, paint: Tensor, told: Told | None, before: Tensor | None) -> Tensor:
+    """Return the mean to which the brightest channel of `paint` (N,) is drawn (see `_balance`): a natural logarithm.
+
+    Lamps should be brighter, and so paint darker, if highlights of paint are too dark (`told`, see `highlights.compare`), or if paint is
+    brighter than it usually is. Each counts by its variance. `before` is what was returned before. It is changed until highlights agree,
+    because photos draw paint elsewhere in between.
+    """
+    logs = plausible(state.learned["albedo"].sigmoid()).log()
+    mean = _mean(state, logs, paint)
+    change, trust = (math.log(PAINT) - mean).clamp_max(0), PAINTS**-2
+    if told is not None:
+        change = (trust * change - told.log / told.variance) / (trust + 1 / told.variance)
+    before = mean if before is None else before
+    return (before + TOWARDS * change).clamp(mean - FARTHEST, mean + FARTHEST)
+
+
+def _mean(state: State, logs: Tensor, paint: Tensor) -> Tensor:
+    """Return the logarithm of the mean of the brightest channel of `paint` (N,), whose base colours are `logs` (N, 3), logarithms."""
+    weight = _area(state.surfels(), paint)
+    mean = (logs.amax(dim=1).exp() * weight).sum() / weight.sum().clamp_min(1e-30)
+    return mean.clamp_min(DARKEST).log()
+
+
+def _balance(state: State, logs: Tensor, paint: Tensor, hue: Tensor, mean: Tensor | None) -> Tensor:
     """Change lamps' radiance a little, and return the change (3,) of paint's base colours that makes up for it, as a logarithm.
 
-    `logs` (N, 3) are logarithms of base colours. The light as a whole is drawn to the `hue` (3,), logarithms. The smaller the part of
-    lamps is, the less changes.
+    `logs` (N, 3) are logarithms of base colours. That of their mean is drawn to `mean`, and the light as a whole to the `hue` (3,),
+    logarithms. The smaller the part of lamps is, the less changes.
     """
     radiance = state.method.light.radiance(state.learned["environment"])
     area = cubemap.texel_solid_angles(math.isqrt(len(radiance) // 6))
     power = radiance * area.to(radiance).view(-1, 1)
     whole, lamps = power.sum(dim=0), radiance > CLIPPED
     part = (power * lamps).sum(dim=0) / whole
-    weight = _area(state.surfels(), paint)
-    mean = (logs.amax(dim=1).exp() * weight).sum() / weight.sum().clamp_min(1e-30)
-    wanted = (PAINT / mean.clamp_min(DARKEST)).log().clamp_max(0) + whole.log() - whole.log().mean() - hue
-    step = part * (STEP * wanted).clamp(-MOST_STEP, MOST_STEP)
+    change = 0.0 if mean is None else mean - _mean(state, logs, paint)
+    change = change + whole.log() - whole.log().mean() - hue
+    step = part * (STEP * change).clamp(-MOST_STEP, MOST_STEP)
     brighter = 1 + ((-step).exp() - 1) / part.clamp_min(1e-6)
     raw = state.learned["environment"]
     raw.copy_(torch.where(lamps, state.method.light.raw(radiance * brighter), raw))

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 
 from refgs.model.surfels import raw_metallic
-from refgs.train.material import base_colors, questions
+from refgs.train.material import base_colors, highlights, questions
 from refgs.train.material.observe import Kinds
 from refgs.train.material.reckoning import like_metals, reckon
 from refgs.train.part import Fact, Part
@@ -32,12 +32,13 @@ class Metals(Part):
     Of each surfel, remember whether hints hold its kind (`held`), whether photos are sure of it (`told`), and the base colour that it
     keeps to (`shown_color`): of metal, what photos tell of it (see `base_colors.told`), and of paint, what it had learned when its shades
     were first kept. Checkpoints also keep `state.told_light`. It is None unless photos tell base colours of some metals that are sure;
-    without masks, they never do. `hue` (3,) is the light's (`base_colors.told_hue`).
+    without masks, they never do. `hue` (3,) is the light's (`base_colors.told_hue`), and `mean` is that of paint (`base_colors.wanted`).
     """
 
-    name, saved = "metals", ("found", "hue")
+    name, saved = "metals", ("found", "hue", "mean")
     found = False
     hue: torch.Tensor
+    mean: torch.Tensor | None = None
 
     def start(self, state: State) -> None:
         self.found, state.told_light = False, None
@@ -175,9 +176,17 @@ def draw_metals(state: State, step: Step) -> None:
 
 
 def level_base_colors(state: State, step: Step) -> None:
-    """Keep mean base colours, and lamps, at what photos and experience tell, see `base_colors`."""
+    """Keep mean base colours, and with them lamps, at what photos and experience tell, see `base_colors`."""
+    part = state.part(Metals)
     if _base_colors_kept(state):
-        base_colors.level(state, *_sure_kinds(state), state.part(Metals).hue)
+        base_colors.level(state, *_sure_kinds(state), part.hue, part.mean)
+
+
+def compare_highlights(state: State, step: Step) -> None:
+    """Learn from highlights, and from experience, how bright paint is in the mean."""
+    if _base_colors_kept(state):
+        part, paint = state.part(Metals), _sure_kinds(state)[1]
+        part.mean = base_colors.wanted(state, paint, highlights.compare(state, step.done), part.mean)
 
 
 def average_paint(state: State, step: Step) -> None:

@@ -1,0 +1,78 @@
+"""Tell how bright lamps are by highlights of paint.
+
+Photos clip what mirrors a lamp. So they hardly tell the lamp's radiance from the base colour of paint: under a lamp twice as bright, paint
+half as bright looks the same. But its highlights do not. A dielectric of index of refraction 1.5 mirrors 4 %, whatever its colour is, so
+few of its highlights are clipped.
+
+The light of all highlights is summed, in photos and in renderings. The sum of a blurred or displaced highlight is that of a sharp one.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from refgs.color import srgb_decode
+from refgs.render.rendering import Rendering
+from refgs.train.learn import exposures
+from refgs.train.photo import Photo
+from refgs.train.state import State
+
+OPAQUE = 0.98  # alpha of a pixel, at least
+VIEWS = 4  # photos that are compared at a time
+SHINES = 0.02  # radiance of a highlight, at least: half of what a dielectric mirrors of a white wall
+REACH = 1 / 60  # of the photo's longer side, by which highlights may be displaced
+PAINT = 0.1  # metallic of a pixel, at most
+LEAST = 0.05  # ratio: where photos have no highlight, errors of what is below may be larger than it
+MODEL = 0.15  # standard deviation of the logarithm, if highlights tell without noise
+
+
+class Told(NamedTuple):
+    """Hold a natural logarithm and its variance."""
+
+    log: float
+    variance: float
+
+
+@torch.no_grad()
+def compare(state: State, seed: int) -> Told | None:
+    """Compare highlights of paint in photos with those in renderings: the logarithm of the ratio of their light.
+
+    It is positive if photos have the brighter highlights. Each `seed` takes other photos. Returns None where nothing shines.
+    """
+    inputs = state.inputs()
+    surfels = inputs.surfels
+    dark = {name: torch.zeros_like(getattr(surfels, name)) for name in ("indirect_dc", "indirect_rest")}
+    matte = inputs._replace(surfels=surfels._replace(**dark), environment=inputs.light.without_reflections())
+    views = torch.randperm(len(state.views), generator=torch.Generator().manual_seed(seed))[:VIEWS].tolist()
+    sums = []
+    for view in views:
+        photo, exposure = state.photo(view), exposures.exposure(state, view)
+        pictures = (state.picture(each, photo.camera, exposure) for each in (inputs, matte))
+        sums.append(_light(photo, *pictures))
+    seen, rendered = torch.stack(sums).double().unbind(dim=1)
+    whole = float(rendered.sum())
+    if whole <= 0 or (rendered > 0).sum() < 2:
+        return None
+    ratio = max(float(seen.sum()) / whole, LEAST)
+    # Variance of a ratio of sums over photos.
+    noise = float((seen - ratio * rendered).square().sum()) * len(views) / (len(views) - 1) / whole**2
+    return Told(math.log(ratio), MODEL**2 + noise / ratio**2)
+
+
+def _light(photo: Photo, shown: Rendering, matte: Rendering) -> Tensor:
+    """Sum the light of highlights of paint: (2,), in the photo and in the rendering `shown`."""
+    seen, shown_light, base = (srgb_decode(x.clamp(0, 1)) for x in (photo.encoded, shown.color, matte.color))
+    paint = shown.alpha > OPAQUE
+    if shown.material is not None:
+        paint &= shown.material[..., 3] < PAINT
+    if photo.mask is not None:
+        paint &= photo.mask > 255 * OPAQUE
+    if shown.visibility is not None:
+        paint &= shown.visibility > 0.5
+    highlight = (shown_light - base).mean(dim=-1) * paint
+    reach = max(1, round(REACH * max(photo.image.shape[:2])))
+    near = torch.nn.functional.max_pool2d(highlight[None], 2 * reach + 1, stride=1, padding=reach)[0]
+    where = paint & (near > SHINES)
+    return torch.stack([((light - base).mean(dim=-1) * where).sum() for light in (seen, shown_light)])

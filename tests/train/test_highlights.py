@@ -1,0 +1,75 @@
+"""Test that highlights of paint tell how bright lamps are, on pictures that the renderer made with other lamps."""
+
+import math
+
+import pytest
+import torch
+
+from refgs.model import cubemap
+from refgs.model.surfels import raw_metallic
+from refgs.render.mirrored_light import SIDE
+from refgs.train.material import highlights, metals
+from tests.makers.training import do, put, trainer
+
+COMPARE, LEVEL = "compare highlights", "level base colours"
+
+
+def shot(capture, folder, lamp=12.0, roughness=0.3, metallic=0.002):
+    """Make a small training whose photos show its own surfels, grey paint under a lamp on one side; the texels of the lamp."""
+    made = trainer(capture, folder, total=400)
+    state = made.state
+    put(made, albedo=torch.tensor([0.3, 0.3, 0.3]).logit(), roughness=math.log(roughness / (1 - roughness)), told=True)
+    put(made, metallic=raw_metallic(metallic))
+    state.part(metals.Metals).found = True
+    state.told_light = torch.zeros(6 * SIDE**2, dtype=torch.bool)
+    light = state.learned["environment"]
+    lamps = cubemap.texel_directions(state.environment().resolution) @ torch.tensor([0.6, 0.0, 0.8]).double() > 0.97
+    light.data.copy_(torch.where(lamps[:, None], lamp, 0.2).log().expand(-1, 3))
+    for view, photo in enumerate(state.photos):
+        picture = state.render(photo.camera).color.clamp(0, 1)
+        state.photos[view] = photo._replace(image=(255 * picture).round().to(torch.uint8), white=255)
+    return state, lamps
+
+
+def dim(state, lamps, factor):
+    """Make lamps `factor` times as bright, and paint darker, so that it looks the same without its highlights."""
+    light = state.learned["environment"].data
+    area = cubemap.texel_solid_angles(state.environment().resolution)[:, None]
+    before = float((light.exp() * area).sum())
+    light[lamps] += math.log(factor)
+    color = state.surfels().albedo.detach() * before / float((light.exp() * area).sum())
+    state.learned["albedo"].data.copy_(color.clamp(0.02, 0.98).logit())
+
+
+def test_lamps_that_are_too_dim_or_too_bright_are_noticed(sharp_ball, tmp_path):
+    state, lamps = shot(sharp_ball, tmp_path / "run")
+    for factor, before in ((1.0, 1.0), (0.5, 1.0), (2.0, 0.5)):
+        dim(state, lamps, factor / before)
+        told = highlights.compare(state, 0)
+        assert told.log == pytest.approx(-math.log(factor), abs=0.35)
+        assert (abs(told.log) < 0.03) == (factor == 1), "the photos are the renderer's own"
+
+
+def test_other_roughness_is_not_taken_for_other_lamps(sharp_ball, tmp_path):
+    state, _ = shot(sharp_ball, tmp_path / "run")
+    for roughness in (0.25, 0.4):
+        state.learned["roughness"].data.fill_(math.log(roughness / (1 - roughness)))
+        told = highlights.compare(state, 0)
+        assert abs(told.log) < 0.2, roughness
+
+
+def test_lamps_are_balanced_until_highlights_agree(sharp_ball, tmp_path):
+    """Check that paint that photos have made too bright, under lamps that are too dim, becomes as it was in the photos."""
+    state, lamps = shot(sharp_ball, tmp_path / "run")
+    power = state.learned["environment"].detach().exp()[lamps].mean()
+    dim(state, lamps, 0.5)
+    for turn in range(12):
+        do(state, COMPARE, 0.4, done=8 * turn)
+        for _ in range(4):
+            do(state, LEVEL, 0.4, done=160)
+    assert float(state.learned["environment"].detach().exp()[lamps].mean() / power) == pytest.approx(1, abs=0.15)
+    assert float(state.surfels().albedo.detach().mean()) == pytest.approx(0.3, abs=0.04)
+
+
+def test_metal_tells_nothing(sharp_ball, tmp_path):
+    assert highlights.compare(shot(sharp_ball, tmp_path / "run", metallic=0.98)[0], 0) is None
