@@ -86,8 +86,8 @@ class SurfelSettings(_Section):
     budget: int = Field(ge=1, le=10_000_000, description="maximum number of surfels")
     density: float = Field(
         ge=0,
-        description="maximum number of surfels for each pixel of the object in a photo, where that is less than budget, but "
-        "at least twice start; 0: budget alone counts",
+        description="maximum number of surfels for each pixel of the object in a photo, where that is less than budget and more "
+        "than twice start; smaller objects have 1 a pixel; 0: budget, start and the light's resolution are as set",
     )
     hull: int = Field(ge=16, le=512, description="voxels along each side of the visual hull")
     inside: float = Field(

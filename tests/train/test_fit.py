@@ -11,6 +11,7 @@ from refgs.asked import Asked
 from refgs.capture import read_capture
 from refgs.effective import Effective
 from refgs.settings import load_settings
+from refgs.train.decide.object_size import LEAST
 from refgs.train.fit import FASTEST, REHEARSED, WARM, _scheduled, between, fitting
 from refgs.train.plan import Plan
 
@@ -41,7 +42,7 @@ def test_rates_change_only_beyond_the_presets(part, factor):
 
 
 def test_more_time_brings_more_of_all(ball_capture, tmp_path):
-    """Check that a longer training has more surfels, more iterations and lower learning rates.
+    """Check that a longer training has a finer mesh, more iterations and lower learning rates, and surfels as the object needs them.
 
     The durations range from less than the preset `quick` takes to more than `standard` takes. No training is run to its end.
     """
@@ -53,14 +54,14 @@ def test_more_time_brings_more_of_all(ball_capture, tmp_path):
         made = fitting(capture, Effective.of(quick), standard, tmp_path, Plan(minutes), "cpu", report)
         found.append(made.state.settings)
         assert made.state.total == made.state.settings.train.iterations and made.state.report is report
-        if made.state.settings.surfels.budget == QUICK.surfels.budget:  # the rehearsal's iterations count as done
+        if made.state.settings.mesh == QUICK.mesh:  # the rehearsal's iterations count as done
             assert WARM < made.state.iteration <= REHEARSED and made.state.seconds > 0
         else:
             assert made.state.iteration == 0 and made.state.seconds == 0
     short, *_, long = found
-    assert short.surfels.budget == QUICK.surfels.budget and short.train.iterations < QUICK.train.iterations
+    assert short.train.iterations < QUICK.train.iterations
     assert short.densify.every < QUICK.densify.every and short.indirect.every < QUICK.indirect.every
-    assert long.surfels.budget == 2 * long.surfels.start == 112_500  # the ball is small
+    assert {each.surfels.budget for each in found} == {LEAST} and long.mesh.triangles > QUICK.mesh.triangles  # the ball is small
     assert long.train.iterations > 2 * STANDARD.train.iterations
     ratio = QUICK.train.iterations / short.train.iterations
     assert short.rates.albedo == pytest.approx(min(ratio**0.5, FASTEST) * QUICK.rates.albedo, rel=1e-3)
@@ -69,7 +70,7 @@ def test_more_time_brings_more_of_all(ball_capture, tmp_path):
     assert long.rates.position == pytest.approx(STANDARD.rates.position / ratio**0.5, rel=1e-3)
     for less, more in pairwise(found):
         assert less.rates.albedo >= more.rates.albedo
-        assert less.surfels.budget <= more.surfels.budget and less.train.iterations < more.train.iterations
+        assert less.mesh.triangles <= more.mesh.triangles and less.train.iterations < more.train.iterations
     assert sum("surfels start on" in line for line in said) == 3
     planned = [line for line in said if line.startswith("planned for")]
     assert [line.split(" minutes")[0] for line in planned] == [f"planned for {m}" for m in ("0.2", "6", "600")]

@@ -9,7 +9,7 @@ from refgs.capture import Capture
 from refgs.effective import Effective
 from refgs.events import Report
 from refgs.settings import RATES, Settings, validate
-from refgs.train.decide.object_size import object_size, surfel_budget
+from refgs.train.decide.object_size import object_size, surfel_limits
 from refgs.train.learn import coarse
 from refgs.train.learn.poses import Poses
 from refgs.train.plan import FULL, OTHERS, PART, STARTS, Plan, by_pixels, growth, iterations_time
@@ -60,13 +60,14 @@ def fitting(
     def iterations(settings: Settings) -> float:
         """Estimate how many iterations with these settings fit into the time that is left."""
         larger = _pixels(capture, settings) / pixels
+        asked, budget = surfel_limits(settings.surfels, size.area * larger)
         # Fewer points may be known to start from than the settings ask for.
-        start = settings.surfels.start if first == quick.surfels.start else first
+        start = asked if first == trainer.state.settings.surfels.start else first
         one = pace * (OTHERS + start) / (OTHERS + first) * by_pixels(size.span**2 or pixels / views, larger)
         left = plan.given - plan.spent
         if settings is not quick:
             left -= (started - begun) * larger  # richer settings need a second start
-        more = growth(start, surfel_budget(settings.surfels, size.area * larger))
+        more = growth(start, budget)
         stages = FULL if settings.image.coarse == "off" else coarse.stages(size.span * larger**0.5, detail)
         return (left / one - more * plan.end(views, one * more)) / iterations_time(more, 1.0, stages)
 

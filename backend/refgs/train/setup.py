@@ -14,7 +14,7 @@ from refgs.events import Report
 from refgs.model.learned import Learned
 from refgs.model.surfels import Parameters, activate
 from refgs.train.decide import needs
-from refgs.train.decide.object_size import limit_surfels, object_size
+from refgs.train.decide.object_size import limit_sizes, object_size
 from refgs.train.keep.progress import Means
 from refgs.train.learn import coarse, light, outlines, priors
 from refgs.train.learn.coarse import Coarse
@@ -48,6 +48,7 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     """Read a capture's photos, and make all parameters and the optimiser."""
     state = State(capture, effective, folder, report, plan, device)
     needs.evaluate(state, "photos")
+    limit_sizes(state)
     state.photos = [Photo.of(view, state.device) for view in state.views]
     with state.clock.part("start"):
         start = start_parameters(capture, state.views, state.settings)
@@ -66,9 +67,7 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     for part in state.parts.values():
         part.start(state)
     needs.evaluate(state, "start")
-    size = object_size(state)
-    limit_surfels(state, size.area)
-    coarse.begin(state, size.span, refined=state.part(Poses).values is not None)
+    coarse.begin(state, object_size(state).span, refined=state.part(Poses).values is not None)
     if plan.pays_at_start("normals that outlines tell", OUTLINES * hull):
         outlines.load(state, start.points.hull)
     priors.load(state)

@@ -1,5 +1,6 @@
-"""Measure how large the object is in the photos, and limit the number of surfels to what this size needs."""
+"""Measure how large the object is in the photos, and limit surfels and the light's texels to what photos of this size show."""
 
+import math
 from statistics import median
 from typing import NamedTuple
 
@@ -11,7 +12,11 @@ from refgs.train.photo import crop_of
 from refgs.train.state import State
 
 SIZE_VIEWS = 24  # views that are measured, at most
-LEAST_GROWTH = 2  # even the smallest object may get this many times the surfels of the start
+LEAST = 10_000  # surfels that even the smallest object may get
+STARTS = 2 / 3  # of the budget: surfels at the start, at most
+GROWTH = 2  # times the surfels of the start
+RADIUS = 1 / 4  # of the object's span: the radius of a convex mirror that tells how fine the light's texels are
+LEAST_TEXELS = 64  # along a side of the light's cubemap: no fewer for a small object
 
 
 class ObjectSize(NamedTuple):
@@ -43,18 +48,42 @@ def object_size(state: State) -> ObjectSize:
     return ObjectSize(median(spans), median(areas))
 
 
-def surfel_budget(settings: SurfelSettings, area: float) -> int:
-    """Return how many surfels an object of `area` pixels may get: `density` surfels a pixel.
+def surfel_limits(settings: SurfelSettings, area: float) -> tuple[int, int]:
+    """Return how many surfels an object of `area` pixels may have at the start, and later.
 
-    The number is at least LEAST_GROWTH · `start`, but never above `budget`. If `density` is 0, the number is `budget`.
+    Later, there may be one surfel a pixel until they are GROWTH times `start`, and `density` surfels a pixel of larger objects. There may
+    always be LEAST, but never more than `budget`. If that is less than `budget`, the start has at most STARTS times as many. An `area` of 0
+    is not known. If `density` is 0, both numbers are as set.
     """
     if settings.density == 0:
-        return settings.budget
-    return min(settings.budget, max(LEAST_GROWTH * settings.start, round(settings.density * area)))
+        return settings.start, settings.budget
+    grown = GROWTH * settings.start
+    budget = max(min(max(area, LEAST), grown), settings.density * area) if area else grown
+    if budget >= settings.budget:
+        return settings.start, settings.budget
+    return min(settings.start, round(STARTS * budget)), round(budget)
 
 
-def limit_surfels(state: State, area: float) -> None:
-    """Lower the surfel budget to what an object of `area` pixels in a photo needs."""
-    if (budget := surfel_budget(state.settings.surfels, area)) < state.settings.surfels.budget:
-        known = f"the object covers {area:,.0f} pixels of a photo" if area else "no masks show the object's size"
-        state.change("surfels.budget", budget, "photos", known)
+def light_resolution(finest: int, span: float) -> int:
+    """Return how many texels along a side the light's cubemap gets for an object that spans so many pixels, at most `finest`.
+
+    In the middle of a ball whose radius is r pixels, mirror directions of neighbouring pixels are 2 / r radians apart. Elsewhere they are
+    farther apart. Photos do not show finer texels, and held-out photos are explained less well with them.
+    """
+    side = finest
+    while side > LEAST_TEXELS and 0 < span * RADIUS * math.pi / 2 <= 2 * (side // 2):
+        side //= 2
+    return side
+
+
+def limit_sizes(state: State) -> None:
+    """Lower the number of surfels, and of the light's texels, to what the photos of the object need."""
+    size, settings = object_size(state), state.settings
+    known = f"the object covers {size.area:,.0f} pixels of a photo" if size.area else "no masks show the object's size"
+    start, budget = surfel_limits(settings.surfels, size.area)
+    for key, now, limit in (("start", settings.surfels.start, start), ("budget", settings.surfels.budget, budget)):
+        if limit < now:
+            state.change(f"surfels.{key}", limit, "photos", known)
+    finest = settings.environment.resolution
+    if settings.surfels.density and (side := light_resolution(finest, size.span)) < finest:
+        state.change("environment.resolution", side, "photos", f"the object spans {size.span:,.0f} pixels of a photo")
