@@ -219,8 +219,9 @@ def test_highlights_outweigh_what_paint_usually_is(start, tmp_path):
     lower = torch.tensor(0.5).log()
     assert wanted(darker, lower) < 0.5, "photos have drawn it back"
     assert wanted(Told(3.0, 0.02), lower) == pytest.approx(0.6 * math.exp(-base_colors.FARTHEST), rel=1e-3)
+    assert wanted(Told(3.0, 0.02), torch.tensor(0.36).log()) >= base_colors.PAINT - 1e-6, "paint is seldom so dark"
     state.learned["albedo"].data.fill_(-2.2)
-    assert wanted(None) == pytest.approx(0.1, rel=0.01), "dark paint is left alone"
+    assert wanted(None) == wanted(darker) == pytest.approx(0.1, rel=0.01), "dark paint is left alone"
 
 
 def test_a_light_without_lamps_is_kept(start, tmp_path):

@@ -18,7 +18,7 @@ def shot(capture, folder, lamp=12.0, roughness=0.3, metallic=0.002):
     """Make a small training whose photos show its own surfels, grey paint under a lamp on one side; the texels of the lamp."""
     made = trainer(capture, folder, total=400)
     state = made.state
-    put(made, albedo=torch.tensor([0.3, 0.3, 0.3]).logit(), roughness=math.log(roughness / (1 - roughness)), told=True)
+    put(made, albedo=torch.tensor([0.4, 0.4, 0.4]).logit(), roughness=math.log(roughness / (1 - roughness)), told=True)
     put(made, metallic=raw_metallic(metallic))
     state.part(metals.Metals).found = True
     state.told_light = torch.zeros(6 * SIDE**2, dtype=torch.bool)
@@ -68,7 +68,7 @@ def test_lamps_are_balanced_until_highlights_agree(sharp_ball, tmp_path):
         for _ in range(4):
             do(state, LEVEL, 0.4, done=160)
     assert float(state.learned["environment"].detach().exp()[lamps].mean() / power) == pytest.approx(1, abs=0.15)
-    assert float(state.surfels().albedo.detach().mean()) == pytest.approx(0.3, abs=0.04)
+    assert float(state.surfels().albedo.detach().mean()) == pytest.approx(0.4, abs=0.05)
 
 
 def test_metal_tells_nothing(sharp_ball, tmp_path):

@@ -232,7 +232,8 @@ def wanted(state: State, paint: Tensor, told: Told | None, before: Tensor | None
 
     Lamps should be brighter, and so paint darker, if highlights of paint are too dark (`told`, see `highlights.compare`), or if paint is
     brighter than it usually is. Each counts by its variance. `before` is what was returned before. It is changed until highlights agree,
-    because photos draw paint elsewhere in between.
+    because photos draw paint elsewhere in between. Highlights do not make paint darker than it usually is: where the model lacks one that
+    photos have, no lamp would be bright enough.
     """
     logs = plausible(state.learned["albedo"].sigmoid()).log()
     mean = _mean(state, logs, paint)
@@ -240,7 +241,8 @@ def wanted(state: State, paint: Tensor, told: Told | None, before: Tensor | None
     if told is not None:
         change = (trust * change - told.log / told.variance) / (trust + 1 / told.variance)
     before = mean if before is None else before
-    return (before + TOWARDS * change).clamp(mean - FARTHEST, mean + FARTHEST)
+    new = (before + TOWARDS * change).clamp(mean - FARTHEST, mean + FARTHEST)
+    return new.maximum(before.clamp_max(math.log(PAINT)))
 
 
 def _mean(state: State, logs: Tensor, paint: Tensor) -> Tensor:
