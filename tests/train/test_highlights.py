@@ -9,22 +9,28 @@ from refgs.model import cubemap
 from refgs.model.surfels import raw_metallic
 from refgs.render.mirrored_light import SIDE
 from refgs.train.material import highlights, metals
-from tests.makers.training import do, put, trainer
+from tests.makers.training import copied, do, put, trainer
 
 COMPARE, LEVEL = "compare highlights", "level base colours"
 
 
-def shot(capture, folder, lamp=12.0, roughness=0.3, metallic=0.002):
-    """Make a small training whose photos show its own surfels, grey paint under a lamp on one side; the texels of the lamp."""
-    made = trainer(capture, folder, total=400)
+@pytest.fixture(scope="module")
+def start(sharp_ball, tmp_path_factory):
+    """Make a small training. Tests copy it."""
+    return trainer(sharp_ball, tmp_path_factory.mktemp("runs") / "start", total=400)
+
+
+def shot(start, folder, metallic=0.002):
+    """Copy a small training, whose photos then show its own surfels: grey paint under a lamp on one side. Also return the lamp's texels."""
+    made = copied(start, folder)
     state = made.state
-    put(made, albedo=torch.tensor([0.4, 0.4, 0.4]).logit(), roughness=math.log(roughness / (1 - roughness)), told=True)
+    put(made, albedo=torch.tensor([0.4, 0.4, 0.4]).logit(), roughness=torch.tensor(0.3).logit(), told=True)
     put(made, metallic=raw_metallic(metallic))
     state.part(metals.Metals).found = True
     state.told_light = torch.zeros(6 * SIDE**2, dtype=torch.bool)
     light = state.learned["environment"]
     lamps = cubemap.texel_directions(state.environment().resolution) @ torch.tensor([0.6, 0.0, 0.8]).double() > 0.97
-    light.data.copy_(torch.where(lamps[:, None], lamp, 0.2).log().expand(-1, 3))
+    light.data.copy_(torch.where(lamps[:, None], 12.0, 0.2).log().expand(-1, 3))
     for view, photo in enumerate(state.photos):
         picture = state.render(photo.camera).color.clamp(0, 1)
         state.photos[view] = photo._replace(image=(255 * picture).round().to(torch.uint8), white=255)
@@ -41,8 +47,8 @@ def dim(state, lamps, factor):
     state.learned["albedo"].data.copy_(color.clamp(0.02, 0.98).logit())
 
 
-def test_lamps_that_are_too_dim_or_too_bright_are_noticed(sharp_ball, tmp_path):
-    state, lamps = shot(sharp_ball, tmp_path / "run")
+def test_lamps_that_are_too_dim_or_too_bright_are_noticed(start, tmp_path):
+    state, lamps = shot(start, tmp_path / "run")
     for factor, before in ((1.0, 1.0), (0.5, 1.0), (2.0, 0.5)):
         dim(state, lamps, factor / before)
         told = highlights.compare(state, 0)
@@ -50,17 +56,17 @@ def test_lamps_that_are_too_dim_or_too_bright_are_noticed(sharp_ball, tmp_path):
         assert (abs(told.log) < 0.03) == (factor == 1), "the photos are the renderer's own"
 
 
-def test_other_roughness_is_not_taken_for_other_lamps(sharp_ball, tmp_path):
-    state, _ = shot(sharp_ball, tmp_path / "run")
+def test_other_roughness_is_not_taken_for_other_lamps(start, tmp_path):
+    state, _ = shot(start, tmp_path / "run")
     for roughness in (0.25, 0.4):
-        state.learned["roughness"].data.fill_(math.log(roughness / (1 - roughness)))
+        state.learned["roughness"].data.fill_(torch.tensor(roughness).logit())
         told = highlights.compare(state, 0)
         assert abs(told.log) < 0.2, roughness
 
 
-def test_lamps_are_balanced_until_highlights_agree(sharp_ball, tmp_path):
+def test_lamps_are_balanced_until_highlights_agree(start, tmp_path):
     """Check that paint that photos have made too bright, under lamps that are too dim, becomes as it was in the photos."""
-    state, lamps = shot(sharp_ball, tmp_path / "run")
+    state, lamps = shot(start, tmp_path / "run")
     power = state.learned["environment"].detach().exp()[lamps].mean()
     dim(state, lamps, 0.5)
     for turn in range(12):
@@ -71,5 +77,5 @@ def test_lamps_are_balanced_until_highlights_agree(sharp_ball, tmp_path):
     assert float(state.surfels().albedo.detach().mean()) == pytest.approx(0.4, abs=0.05)
 
 
-def test_metal_tells_nothing(sharp_ball, tmp_path):
-    assert highlights.compare(shot(sharp_ball, tmp_path / "run", metallic=0.98)[0], 0) is None
+def test_metal_tells_nothing(start, tmp_path):
+    assert highlights.compare(shot(start, tmp_path / "run", metallic=0.98)[0], 0) is None

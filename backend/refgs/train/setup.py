@@ -48,7 +48,8 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     """Read a capture's photos, and make all parameters and the optimiser."""
     state = State(capture, effective, folder, report, plan, device)
     needs.evaluate(state, "photos")
-    limit_sizes(state)
+    size = object_size(state)
+    limit_sizes(state, size)
     state.photos = [Photo.of(view, state.device) for view in state.views]
     with state.clock.part("start"):
         start = start_parameters(capture, state.views, state.settings)
@@ -67,7 +68,7 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     for part in state.parts.values():
         part.start(state)
     needs.evaluate(state, "start")
-    coarse.begin(state, object_size(state).span, refined=state.part(Poses).values is not None)
+    coarse.begin(state, size.span, refined=state.part(Poses).values is not None)
     if plan.pays_at_start("normals that outlines tell", OUTLINES * hull):
         outlines.load(state, start.points.hull)
     priors.load(state)

@@ -76,9 +76,9 @@ def light_resolution(finest: int, span: float) -> int:
     return side
 
 
-def limit_sizes(state: State) -> None:
-    """Lower the number of surfels, and of the light's texels, to what the photos of the object need."""
-    size, settings = object_size(state), state.settings
+def limit_sizes(state: State, size: ObjectSize) -> None:
+    """Lower the number of surfels, and of the light's texels, to what photos of an object of this `size` need."""
+    settings = state.settings
     known = f"the object covers {size.area:,.0f} pixels of a photo" if size.area else "no masks show the object's size"
     start, budget = surfel_limits(settings.surfels, size.area)
     for key, now, limit in (("start", settings.surfels.start, start), ("budget", settings.surfels.budget, budget)):

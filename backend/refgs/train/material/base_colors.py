@@ -162,7 +162,7 @@ def level(state: State, metals: Tensor, paint: Tensor, hue: Tensor, mean: Tensor
     raw = state.learned["albedo"]
     logs, wrong, weight = _wrong(state, metals)
     off = (weight * wrong).sum(dim=0) / weight.sum().clamp_min(1e-6)
-    logs = logs + torch.where(weight > 0, off, 0) + paint[:, None] * _balance(state, logs, paint, hue, mean)
+    logs = logs + torch.where(weight > 0, off, 0) + paint[:, None] * _balance(state, paint, hue, mean)
     raw.copy_(torch.where((weight > 0) | paint[:, None], torch.logit(plausible(logs.exp())), raw))
 
 
@@ -235,8 +235,7 @@ def wanted(state: State, paint: Tensor, told: Told | None, before: Tensor | None
     because photos draw paint elsewhere in between. Highlights do not make paint darker than it usually is: where the model lacks one that
     photos have, no lamp would be bright enough.
     """
-    logs = plausible(state.learned["albedo"].sigmoid()).log()
-    mean = _mean(state, logs, paint)
+    mean = _mean(state, paint)
     change, trust = (math.log(PAINT) - mean).clamp_max(0), PAINTS**-2
     if told is not None:
         change = (trust * change - told.log / told.variance) / (trust + 1 / told.variance)
@@ -245,25 +244,26 @@ def wanted(state: State, paint: Tensor, told: Told | None, before: Tensor | None
     return new.maximum(before.clamp_max(math.log(PAINT)))
 
 
-def _mean(state: State, logs: Tensor, paint: Tensor) -> Tensor:
-    """Return the logarithm of the mean of the brightest channel of `paint` (N,), whose base colours are `logs` (N, 3), logarithms."""
-    weight = _area(state.surfels(), paint)
-    mean = (logs.amax(dim=1).exp() * weight).sum() / weight.sum().clamp_min(1e-30)
+def _mean(state: State, paint: Tensor) -> Tensor:
+    """Return the logarithm of the mean of the brightest channel of `paint` (N,)."""
+    surfels = state.surfels()
+    weight = _area(surfels, paint)
+    mean = (plausible(surfels.albedo).amax(dim=1) * weight).sum() / weight.sum().clamp_min(1e-30)
     return mean.clamp_min(DARKEST).log()
 
 
-def _balance(state: State, logs: Tensor, paint: Tensor, hue: Tensor, mean: Tensor | None) -> Tensor:
+def _balance(state: State, paint: Tensor, hue: Tensor, mean: Tensor | None) -> Tensor:
     """Change lamps' radiance a little, and return the change (3,) of paint's base colours that makes up for it, as a logarithm.
 
-    `logs` (N, 3) are logarithms of base colours. That of their mean is drawn to `mean`, and the light as a whole to the `hue` (3,),
-    logarithms. The smaller the part of lamps is, the less changes.
+    The mean of `paint` (N,) is drawn to `mean`, and the light as a whole to the `hue` (3,), logarithms. The smaller the part of lamps is,
+    the less changes.
     """
     radiance = state.method.light.radiance(state.learned["environment"])
     area = cubemap.texel_solid_angles(math.isqrt(len(radiance) // 6))
     power = radiance * area.to(radiance).view(-1, 1)
     whole, lamps = power.sum(dim=0), radiance > CLIPPED
     part = (power * lamps).sum(dim=0) / whole
-    change = 0.0 if mean is None else mean - _mean(state, logs, paint)
+    change = 0.0 if mean is None else mean - _mean(state, paint)
     change = change + whole.log() - whole.log().mean() - hue
     step = part * (STEP * change).clamp(-MOST_STEP, MOST_STEP)
     brighter = 1 + ((-step).exp() - 1) / part.clamp_min(1e-6)

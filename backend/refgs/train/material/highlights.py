@@ -23,7 +23,7 @@ OPAQUE = 0.98  # alpha of a pixel, at least
 VIEWS = 4  # photos that are compared at a time
 SHINES = 0.02  # radiance of a highlight, at least: half of what a dielectric mirrors of a white wall
 REACH = 1 / 60  # of the photo's longer side, by which highlights may be displaced
-PAINT = 0.1  # metallic of a pixel, at most
+METALLIC = 0.1  # of a pixel of paint, at most
 LEAST = 0.05  # ratio: where photos have no highlight, errors of what is below may be larger than it
 MODEL = 0.15  # standard deviation of the logarithm, if highlights tell without noise
 
@@ -42,9 +42,7 @@ def compare(state: State, seed: int) -> Told | None:
     It is positive if photos have the brighter highlights. Each `seed` takes other photos. Returns None where nothing shines.
     """
     inputs = state.inputs()
-    surfels = inputs.surfels
-    dark = {name: torch.zeros_like(getattr(surfels, name)) for name in ("indirect_dc", "indirect_rest")}
-    matte = inputs._replace(surfels=surfels._replace(**dark), environment=inputs.light.without_reflections())
+    matte = inputs._replace(environment=inputs.light.without_reflections())
     views = torch.randperm(len(state.views), generator=torch.Generator().manual_seed(seed))[:VIEWS].tolist()
     sums = []
     for view in views:
@@ -66,7 +64,7 @@ def _light(photo: Photo, shown: Rendering, matte: Rendering) -> Tensor:
     seen, shown_light, base = (srgb_decode(x.clamp(0, 1)) for x in (photo.encoded, shown.color, matte.color))
     paint = shown.alpha > OPAQUE
     if shown.material is not None:
-        paint &= shown.material[..., 3] < PAINT
+        paint &= shown.material[..., 3] < METALLIC
     if photo.mask is not None:
         paint &= photo.mask > 255 * OPAQUE
     if shown.visibility is not None:
