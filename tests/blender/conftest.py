@@ -18,9 +18,11 @@ def run_folder(tmp_path):
 
 @pytest.fixture
 def scene():
-    """Open an empty file, and return its scene."""
+    """Open an empty file, and return its scene. It has no shadows, which are most of a frame's time in software."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    return bpy.context.scene
+    scene = bpy.context.scene
+    scene.eevee.use_shadows = False
+    return scene
 
 
 @pytest.fixture

@@ -21,12 +21,6 @@ def no_jobs_are_left():
     jobs.stop_all()
 
 
-@pytest.fixture
-def scene(scene):
-    scene.eevee.use_shadows = False  # no lamps; shadows are most of a frame's time in software
-    return scene
-
-
 def test_a_preview_and_a_sheet_of_the_file_as_it_is(run, scene, tmp_path):
     write_panorama(tmp_path / "red.exr", np.broadcast_to((1, 0.05, 0.05), (8, 16, 3)))
     scene.eevee.use_raytracing = False  # much faster in software

@@ -24,12 +24,6 @@ from tests.makers.runs import COLUMNS, read_exr, write_panorama, write_ply
 SIZE = 64
 
 
-@pytest.fixture
-def scene(scene):
-    scene.eevee.use_shadows = False  # no lamps; shadows are most of a frame's time in software
-    return scene
-
-
 def coloured_sky(direction):
     """Return the sky's linear RGB radiance in the unit directions (…, 3). No two directions have the same colour."""
     return 0.5 + 0.4 * np.asarray(direction)

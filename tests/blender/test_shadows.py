@@ -19,6 +19,7 @@ SIZE = 48
 @pytest.fixture
 def stage(run, scene):
     """Put a floor under the mesh, a box, and a sun that shines from the side by 45°. Look down on all of it; the splats are invisible."""
+    scene.eevee.use_shadows = True
     middle = Vector((1.0, -3.0, 2.0))  # of the box
     scene.world = None
     compat.set_modifier_input(run.splats.modifiers[NAME], "Opacity Cut", 1.0)

@@ -15,12 +15,6 @@ from refgs_addon.scene.world_light import relight
 from tests.makers.runs import write_panorama
 
 
-@pytest.fixture
-def scene(scene):
-    scene.eevee.use_shadows = False  # no lamps; shadows are most of a frame's time in software
-    return scene
-
-
 def test_a_view_under_each_light(run, scene, tmp_path):
     show(run.collection, "splats")
     scene.eevee.use_raytracing = False  # much faster in software

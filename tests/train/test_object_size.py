@@ -5,6 +5,7 @@ import math
 import pytest
 
 from refgs.settings import load_settings
+from refgs.train.decide import lighting
 from refgs.train.decide.object_size import LEAST, light_resolution, object_size, surfel_limits
 from tests.makers.training import trainer
 
@@ -63,3 +64,6 @@ def test_the_limits_and_their_reasons_are_recorded(sharp_ball, tmp_path):
     assert f"{size.span:,.0f} pixels" in changes[0.5]["environment.resolution"].why
     assert settings[0.0].surfels.start == 30000 and settings[0.0].environment.resolution == 128
     assert len(state.learned["position"]) <= 6667
+    state.change("environment.resolution", 16, "needs", "nothing is mirrored")
+    lighting.Light().undo(state, "a look at the photos")
+    assert state.settings.environment.resolution == 64

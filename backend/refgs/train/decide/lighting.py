@@ -10,6 +10,7 @@ from refgs.render.sums import blended_shares
 from refgs.train import probe
 from refgs.train.decide.materials import INDIRECT
 from refgs.train.decide.need import ASKED, MEGA, NUMBER, Decision, Given, Moment, Need, megabytes
+from refgs.train.decide.object_size import object_size, texels_of_light
 from refgs.train.learn import light
 from refgs.train.state import RenderInputs, State
 
@@ -118,7 +119,7 @@ class Light(Need):
         state.change("environment.resolution", int(found.side or 0), "needs", found.why)
 
     def undo(self, state: State, why: str) -> None:
-        state.change("environment.resolution", state.effective.asked.environment.resolution, "needs", why)
+        state.change("environment.resolution", texels_of_light(state, object_size(state).span), "needs", why)
 
 
 def resolvable(roughness: float, part: float, finest: int, coarsest: int) -> int:

@@ -78,12 +78,17 @@ def light_resolution(finest: int, span: float) -> int:
 
 def limit_sizes(state: State, size: ObjectSize) -> None:
     """Lower the number of surfels, and of the light's texels, to what photos of an object of this `size` need."""
-    settings = state.settings
+    settings = state.settings.surfels
     known = f"the object covers {size.area:,.0f} pixels of a photo" if size.area else "no masks show the object's size"
-    start, budget = surfel_limits(settings.surfels, size.area)
-    for key, now, limit in (("start", settings.surfels.start, start), ("budget", settings.surfels.budget, budget)):
+    start, budget = surfel_limits(settings, size.area)
+    for key, now, limit in (("start", settings.start, start), ("budget", settings.budget, budget)):
         if limit < now:
             state.change(f"surfels.{key}", limit, "photos", known)
-    finest = settings.environment.resolution
-    if settings.surfels.density and (side := light_resolution(finest, size.span)) < finest:
+    if (side := texels_of_light(state, size.span)) < state.settings.environment.resolution:
         state.change("environment.resolution", side, "photos", f"the object spans {size.span:,.0f} pixels of a photo")
+
+
+def texels_of_light(state: State, span: float) -> int:
+    """Return how many texels along a side the light's cubemap has unless nothing is mirrored sharply: what the user asked for, or fewer."""
+    asked = state.effective.asked.environment.resolution
+    return light_resolution(asked, span) if state.settings.surfels.density else asked
