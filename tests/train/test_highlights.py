@@ -1,4 +1,4 @@
-"""Test that highlights of paint tell how bright lamps are, on pictures that the renderer made with other lamps."""
+"""Test that highlights of paint tell how bright lamps are, and how glossy paint is, on pictures that the renderer made."""
 
 import math
 
@@ -8,10 +8,11 @@ import torch
 from refgs.model import cubemap
 from refgs.model.surfels import raw_metallic
 from refgs.render.mirrored_light import SIDE
-from refgs.train.material import highlights, metals
+from refgs.train.material import gloss, highlights, metals
 from tests.makers.training import copied, do, put, trainer
 
 COMPARE, LEVEL = "compare highlights", "level base colours"
+FIND, KEEP = "find glossy paint", "keep paint glossy"
 
 
 @pytest.fixture(scope="module")
@@ -20,11 +21,11 @@ def start(sharp_ball, tmp_path_factory):
     return trainer(sharp_ball, tmp_path_factory.mktemp("runs") / "start", total=400)
 
 
-def shot(start, folder, metallic=0.002):
+def shot(start, folder, metallic=0.002, roughness=0.3):
     """Copy a small training, whose photos then show its own surfels: grey paint under a lamp on one side. Also return the lamp's texels."""
     made = copied(start, folder)
     state = made.state
-    put(made, albedo=torch.tensor([0.4, 0.4, 0.4]).logit(), roughness=torch.tensor(0.3).logit(), told=True)
+    put(made, albedo=torch.tensor([0.4, 0.4, 0.4]).logit(), roughness=torch.tensor(roughness).logit(), told=True)
     put(made, metallic=raw_metallic(metallic))
     state.part(metals.Metals).found = True
     state.told_light = torch.zeros(6 * SIDE**2, dtype=torch.bool)
@@ -58,7 +59,7 @@ def test_lamps_that_are_too_dim_or_too_bright_are_noticed(start, tmp_path):
 
 def test_other_roughness_is_not_taken_for_other_lamps(start, tmp_path):
     state, _ = shot(start, tmp_path / "run")
-    for roughness in (0.25, 0.4):
+    for roughness in (0.25, 0.37):
         state.learned["roughness"].data.fill_(torch.tensor(roughness).logit())
         told = highlights.compare(state, 0)
         assert abs(told.log) < 0.2, roughness
@@ -79,3 +80,40 @@ def test_lamps_are_balanced_until_highlights_agree(start, tmp_path):
 
 def test_metal_tells_nothing(start, tmp_path):
     assert highlights.compare(shot(start, tmp_path / "run", metallic=0.98)[0], 0) is None
+
+
+def learned(state, roughness):
+    """Set the roughness that was learned; return its mean after photos have been compared."""
+    state.learned["roughness"].data.fill_(torch.tensor(roughness).logit())
+    do(state, FIND, 0.5, done=34)
+    do(state, KEEP, 0.5, done=20)
+    return float(state.surfels().roughness.detach().mean())
+
+
+def test_paint_that_became_rough_is_glossy_again(start, tmp_path):
+    """Check that roughness falls, look by look, until pictures vary as photos do: also if highlights are elsewhere, and photos noisy."""
+    state, _ = shot(start, tmp_path / "run")
+    found = learned(state, 0.7)
+    assert found < 0.6
+    for _ in range(8):
+        found = learned(state, found)
+    assert found == pytest.approx(0.3, abs=0.08)
+    light = state.learned["environment"].data
+    light.copy_(light.view(6, -1, 3).flip(1).reshape(-1, 3))  # highlights move
+    for view, photo in enumerate(state.photos):
+        noise = torch.randn(photo.image.shape, generator=torch.Generator().manual_seed(view))
+        state.photos[view] = photo._replace(image=(photo.image + 3 * noise).clamp(0, 255).to(torch.uint8))
+    assert learned(state, 0.7) < 0.6
+
+
+def test_paint_that_is_rough_stays_so(start, tmp_path):
+    state, _ = shot(start, tmp_path / "run", roughness=0.7)
+    for roughness, bounds in ((0.7, (0.68, 0.98)), (0.4, (0.39, 0.401))):
+        assert bounds[0] <= learned(state, roughness) <= bounds[1], "what is too glossy learns by itself"
+    assert float(state.learned["roughest"].detach().mean()) > 0.45
+
+
+def test_metal_may_be_rough(start, tmp_path):
+    state, _ = shot(start, tmp_path / "run", metallic=0.98)
+    assert learned(state, 0.9) == pytest.approx(0.9, abs=1e-3)
+    assert (gloss.roughest(state, torch.zeros(state.learned.count, dtype=torch.bool), 0) == 1).all()

@@ -51,6 +51,8 @@ ACTIONS: dict[str, Callable[[State, Step], object]] = {
     "judge metals": metals.judge,
     "even coloured metal out": even_metal.even_out,
     "level base colours": metals.level_base_colors,
+    "find glossy paint": metals.find_glossy_paint,
+    "keep paint glossy": metals.keep_paint_glossy,
     "compare highlights": metals.compare_highlights,
     "draw metals' base colours": metals.draw_metals,
     "average paint's base colours": metals.average_paint,

@@ -60,7 +60,7 @@ class Specular(Need):
     def apply(self, state: State, found: Found) -> None:
         state.change("render.reflection", "none", "needs", found.why)
         state.occluder = state.told_light = None
-        state.learned.drop("metallic", "roughness", "held", "told", "shown_color", *INDIRECT)
+        state.learned.drop("metallic", "roughness", "held", "told", "shown_color", "roughest", *INDIRECT)
 
     def undo(self, state: State, why: str) -> None:
         state.change("render.reflection", state.effective.asked.render.reflection, "needs", why)

@@ -23,8 +23,9 @@ def as_of_today(
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Convert the tensors and facts of a checkpoint of release 0.1.0 to the present form. Return those of later releases unchanged.
 
-    0.1.0 had no `held`, `told` and `shown_color`: surfels with a metallic value in HELD did not learn it. All parts (see `Part`) shared one
-    table of facts. Linear light was the softplus of raw texels, and is their exponential now. `light` is how the run represents light.
+    0.1.0 had no `held`, `told`, `shown_color` and `roughest`: surfels with a metallic value in HELD did not learn it. All parts (see
+    `Part`) shared one table of facts. Linear light was the softplus of raw texels, and is their exponential now. `light` is how the run
+    represents light.
     """
     if "residual" in facts:
         return tensors, facts
@@ -36,9 +37,11 @@ def as_of_today(
         tensors["parameter.held"] = torch.isin(metallic, torch.tensor([raw_metallic(value) for value in HELD]))
         tensors["parameter.told"] = torch.zeros_like(tensors["parameter.held"])
         tensors["parameter.shown_color"] = torch.zeros(len(metallic), 4)
+        tensors["parameter.roughest"] = torch.ones(len(metallic))
     elif "constant.metallic" in tensors:
         tensors["constant.held"] = tensors["constant.told"] = torch.zeros(1, dtype=torch.bool)
         tensors["constant.shown_color"] = torch.zeros(1, 4)
+        tensors["constant.roughest"] = torch.ones(1)
     harmonics = tensors.get("parameter.sh_rest")
     known = {"spent": facts.get("seconds", 0.0), "processor_seconds": 0.0, "decided": {}, "needs": {}} | facts
     known |= {"residual": harmonics is not None and bool(harmonics.any()), "clock": facts.get("parts", {})}

@@ -198,6 +198,15 @@ def _alike(logs: Tensor, near: Tensor, which: Tensor, weight: Tensor) -> Tensor:
     return weight / weight.sum(dim=1, keepdim=True).clamp_min(1e-6)
 
 
+def spread_alike(values: Tensor, surfels: Surfels, logs: Tensor, which: Tensor, weight: Tensor) -> Tensor:
+    """Average `values` (N, C) of surfels in `which` (N,) over PASSES times AVERAGED neighbours with like colours (see `_alike`)."""
+    near = neighbours(surfels.positions, AVERAGED, which)
+    alike, values = _alike(logs, near, which, weight), values.clone()
+    for _ in range(PASSES):
+        values[which] = (alike[..., None] * values[near]).sum(dim=1)
+    return values
+
+
 @torch.no_grad()
 def keep_shades(state: State, metals: Tensor, paint: Tensor) -> None:
     """Keep shades of base colours: of `metals` (N,) what photos tell, of `paint` (N,) what was learned when this was first done.
@@ -212,10 +221,7 @@ def keep_shades(state: State, metals: Tensor, paint: Tensor) -> None:
     kept, surfels = logs + wrong, state.surfels()
     for kind in metals & (known[:, 0] > 0), paint:
         if kind.any():
-            near = neighbours(surfels.positions, AVERAGED, kind)
-            alike = _alike(kept, near, kind, surfels.opacities * known[:, 0])
-            for _ in range(PASSES):
-                wrong[kind] = (alike[..., None] * wrong[near]).sum(dim=1)
+            wrong = spread_alike(wrong, surfels, kept, kind, surfels.opacities * known[:, 0])
     area = _area(surfels, paint)[:, None]
     wrong[paint] -= (area * wrong).sum(dim=0) / area.sum().clamp_min(1e-30)
     raw[which] = torch.logit(plausible((logs + weight * wrong)[which].exp()))

@@ -24,6 +24,7 @@ VIEWS = 4  # photos that are compared at a time
 SHINES = 0.02  # radiance of a highlight, at least: half of what a dielectric mirrors of a white wall
 REACH = 1 / 60  # of the photo's longer side, by which highlights may be displaced
 METALLIC = 0.1  # of a pixel of paint, at most
+GLOSSY = 0.4  # roughness of paint, at most: base colours learn what wider highlights lack
 LEAST = 0.05  # ratio: where photos have no highlight, errors of what is below may be larger than it
 MODEL = 0.15  # standard deviation of the logarithm, if highlights tell without noise
 
@@ -64,7 +65,7 @@ def _light(photo: Photo, shown: Rendering, matte: Rendering) -> Tensor:
     seen, shown_light, base = (srgb_decode(x.clamp(0, 1)) for x in (photo.encoded, shown.color, matte.color))
     paint = shown.alpha > OPAQUE
     if shown.material is not None:
-        paint &= shown.material[..., 3] < METALLIC
+        paint &= (shown.material[..., 3] < METALLIC) & (shown.material[..., 4] < GLOSSY)
     if photo.mask is not None:
         paint &= photo.mask > 255 * OPAQUE
     if shown.visibility is not None:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 
 from refgs.model.surfels import raw_metallic
-from refgs.train.material import base_colors, highlights, questions
+from refgs.train.material import base_colors, gloss, highlights, questions
 from refgs.train.material.observe import Kinds
 from refgs.train.material.reckoning import like_metals, reckon
 from refgs.train.part import Fact, Part
@@ -29,10 +29,11 @@ TOLD = 0.005  # a change of a larger fraction of the surface is announced
 class Metals(Part):
     """Remember whether metals have already been `found`.
 
-    Of each surfel, remember whether hints hold its kind (`held`), whether photos are sure of it (`told`), and the base colour that it
-    keeps to (`shown_color`): of metal, what photos tell of it (see `base_colors.told`), and of paint, what it had learned when its shades
-    were first kept. Checkpoints also keep `state.told_light`. It is None unless photos tell base colours of some metals that are sure;
-    without masks, they never do. `hue` (3,) is the light's (`base_colors.told_hue`), and `mean` is that of paint (`base_colors.wanted`).
+    Of each surfel, remember whether hints hold its kind (`held`), whether photos are sure of it (`told`), how rough it is at most
+    (`roughest`, see `gloss`), and the base colour that it keeps to (`shown_color`): of metal, what photos tell of it (see
+    `base_colors.told`), and of paint, what it had learned when its shades were first kept. Checkpoints also keep `state.told_light`. It is
+    None unless photos tell base colours of some metals that are sure; without masks, they never do. `hue` (3,) is the light's
+    (`base_colors.told_hue`), and `mean` is that of paint (`base_colors.wanted`).
     """
 
     name, saved = "metals", ("found", "hue", "mean")
@@ -44,6 +45,7 @@ class Metals(Part):
         self.found, state.told_light = False, None
         self.hue = torch.zeros(3, device=state.device)
         if "metallic" in state.learned:
+            state.learned.learn("roughest", torch.ones(state.learned.count, device=state.device))
             state.learned.learn("shown_color", torch.zeros(state.learned.count, 4, device=state.device))
             for name in ("held", "told"):
                 none = torch.zeros(state.learned.count, dtype=torch.bool, device=state.device)
@@ -189,6 +191,21 @@ def compare_highlights(state: State, step: Step) -> None:
         part.mean = base_colors.wanted(state, paint, highlights.compare(state, step.done), part.mean)
 
 
+@torch.no_grad()
+def find_glossy_paint(state: State, step: Step) -> None:
+    """Tell how rough paint is at most, see `gloss`."""
+    if _gloss_learns(state):
+        state.learned["roughest"].copy_(gloss.roughest(state, _sure_kinds(state)[1], step.done))
+
+
+@torch.no_grad()
+def keep_paint_glossy(state: State, step: Step) -> None:
+    """Keep paint no rougher than photos tell."""
+    if _gloss_learns(state):
+        raw = state.learned["roughness"]
+        raw.copy_(raw.minimum(base_colors.plausible(state.learned["roughest"]).logit()))
+
+
 def average_paint(state: State, step: Step) -> None:
     """Average base colours of paint over neighbours, so that the light learns shades, and not the paint."""
     if _base_colors_kept(state):
@@ -204,6 +221,10 @@ def keep_shades(state: State, step: Step) -> None:
 def _base_colors_kept(state: State) -> bool:
     """Tell whether photos tell base colours of metals, so that they tell the light."""
     return state.told_light is not None and {"albedo", "metallic"} <= state.learned.keys()
+
+
+def _gloss_learns(state: State) -> bool:
+    return {"roughness", "roughest"} <= state.learned.keys()
 
 
 def _sure_kinds(state: State) -> tuple[torch.Tensor, torch.Tensor]:
