@@ -80,6 +80,11 @@ def spread_views(state: State, most: int = VIEWS) -> list[int]:
     return spread(range(len(state.photos)), most)
 
 
+def random_views(state: State, seed: int, most: int) -> list[int]:
+    """Return the indices of at most `most` training views. Each `seed` chooses others."""
+    return torch.randperm(len(state.views), generator=torch.Generator().manual_seed(seed))[:most].tolist()
+
+
 @torch.no_grad()
 def on_object(state: State, surfels: Surfels, view: int) -> Tensor:
     """Tell which pixels (H, W) of a training view's crop show the object: those in the mask and in the region to train.

@@ -24,9 +24,8 @@ VIEWS = 12  # photos that are compared at a time
 NEAR = 9  # neighbours whose radiance is averaged, so that noise of pixels does not count
 GLOSSIER = 0.5  # factor on roughness in the second rendering, which tells how the variance depends on it
 LEAST = 0.2  # roughness; glossier paint learns by itself
-LEARNED = 0.7  # standard deviation of the logarithm of learned roughness
+LEARNED = 0.7  # standard deviation of the logarithm of learned roughness; no step is larger
 MODEL = 0.6  # standard deviation of the logarithm of the variances' ratio, if roughness is right
-MOST_STEP = 0.7  # logarithm of roughness
 DARK = 1e-9  # variance
 
 
@@ -43,12 +42,12 @@ def roughest(state: State, paint: Tensor, seed: int) -> Tensor:
     learned = inputs.surfels.roughness
     other = base_colors.plausible(torch.where(paint, GLOSSIER * learned, learned))
     glossier = inputs._replace(surfels=inputs.surfels._replace(roughness=other))
-    views = torch.randperm(len(state.views), generator=torch.Generator().manual_seed(seed))[:VIEWS].tolist()
+    views = probe.random_views(state, seed, VIEWS)
     sums = torch.stack([_sums(state, view, inputs, glossier) for view in views], dim=1)
     photo, shown, other = (_variances(inputs.surfels, sums, paint) + DARK).log().unbind(dim=1)
     slope = ((other - shown) / -math.log(GLOSSIER)).clamp_min(0)
     step = LEARNED**2 * slope * (photo - shown) / ((LEARNED * slope).square() + MODEL**2)
-    found = learned.clamp_min(LEAST) * (-step.clamp(-MOST_STEP, MOST_STEP)).exp()
+    found = learned.clamp_min(LEAST) * (-step.clamp(-LEARNED, LEARNED)).exp()
     return torch.where(paint, found.clamp(LEAST, 1), 1)
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from refgs.color import srgb_decode
 from refgs.render.rendering import Rendering
+from refgs.train import probe
 from refgs.train.learn import exposures
 from refgs.train.photo import Photo
 from refgs.train.state import State
@@ -44,7 +45,7 @@ def compare(state: State, seed: int) -> Told | None:
     """
     inputs = state.inputs()
     matte = inputs._replace(environment=inputs.light.without_reflections())
-    views = torch.randperm(len(state.views), generator=torch.Generator().manual_seed(seed))[:VIEWS].tolist()
+    views = probe.random_views(state, seed, VIEWS)
     sums = []
     for view in views:
         photo, exposure = state.photo(view), exposures.exposure(state, view)

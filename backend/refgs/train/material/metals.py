@@ -22,7 +22,7 @@ GIVEN = Kinds(metal=0.9, paint=0.02)  # metallic that is set where photos are no
 HELD = Kinds(metal=0.98, paint=0.002)  # metallic that does not learn, in the order of `hints.KINDS`
 LIKELY = 1 - questions.DOUBTFUL / 2  # probability of metal, or of paint, from which on metallic is set
 SURE = 0.95  # probability from which on it does not learn
-SHARP = Kinds(metal=0.1, paint=0.2)  # roughness from which surfels learn, at most, once metals are found
+SHARP = Kinds(metal=0.1, paint=gloss.LEAST)  # roughness from which surfels learn, at most, once metals are found
 TOLD = 0.005  # a change of a larger fraction of the surface is announced
 
 
