@@ -1,5 +1,7 @@
 """Make points of a ball that stands on a board, what photos show of them, and what is reckoned from that."""
 
+import math
+
 import torch
 
 from refgs.model.surfels import activate
@@ -18,6 +20,24 @@ def ball_on_board(count=4000):
     points = torch.cat([normal + torch.tensor([0.0, 0.0, 1.0]), board])
     ball = torch.arange(len(points)) < len(normal)
     return points, torch.cat([normal, up]), ball
+
+
+def rounded(points, normals, ball, radius=0.1):
+    """Round the crease between ball and board by a fillet of that `radius`, as a visual hull does. It belongs to neither."""
+    middle = torch.tensor([2 * radius**0.5, radius])  # of the circle that touches both: across and up
+    tangent = 1 - (1 - radius) / (1 + radius)  # height at which it touches the ball
+    across = points[:, :2].norm(dim=1)
+    kept = torch.where(ball, points[:, 2] > tangent, across > middle[0])
+    generator = torch.Generator().manual_seed(1)
+    turn, arc = torch.rand(2, 2000, generator=generator)
+    angle = -torch.pi / 2 - arc * math.acos(1 - tangent / radius)
+    ring = torch.stack([angle.cos(), angle.sin()])  # from the circle's middle to the fillet
+    out, up = middle[:, None] + radius * ring
+    around = torch.stack([(2 * torch.pi * turn).cos(), (2 * torch.pi * turn).sin()])
+    fillet = torch.cat([out * around, up[None]]).T
+    facing = -torch.cat([ring[0] * around, ring[1:]]).T
+    joined = (torch.cat([old[kept], new]) for old, new in ((points, fillet), (normals, facing)))
+    return *joined, torch.cat([ball[kept], torch.zeros(len(fillet), dtype=torch.bool)])
 
 
 def seen_as(points, normals, mean=None, shown=None):

@@ -6,7 +6,7 @@ import torch
 
 from refgs.train.material.observe import NEIGHBOURS, neighbours
 from refgs.train.material.same_material import laplacian, spread
-from tests.makers.pieces import ball_on_board, seen_as
+from tests.makers.pieces import ball_on_board, rounded, seen_as
 
 
 def spread_over(points, normals, value, weight, mean=None):
@@ -19,6 +19,15 @@ def test_a_balls_lower_half_is_of_its_upper_halfs_metal():
     told = (ball & (points[:, 2] > 1)).float()
     found = spread_over(points, normals, 3 * told, told)
     assert float((found > 1)[ball].float().mean()) > 0.98 and float((found > 1)[~ball].float().mean()) < 0.02
+
+
+def test_a_rounded_crease_parts_as_a_sharp_one():
+    """Check that evidence for metal hardly crosses a fillet, over which the normals of neighbours differ little."""
+    points, normals, ball = rounded(*ball_on_board(8000))
+    told = ball & (points[:, 2] > 0.5)
+    found = spread_over(points, normals, 3 * told.float(), told.float())
+    board = ~ball & (points[:, :2].norm(dim=1) > 0.8)
+    assert float((found > 1)[ball].float().mean()) > 0.9 and float((found > 1)[board].float().mean()) < 0.02
 
 
 def test_evidence_spreads_as_far_however_dense_surfels_are():

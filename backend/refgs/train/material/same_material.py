@@ -1,7 +1,7 @@
 """Spread evidence over pieces of the surface: what photos tell of some surfels of a piece counts for the others, too.
 
 The model is a random walk (Grady 2006) on a graph of neighbouring surfels. Steps are likely within a piece: a smooth surface of one
-brightness. They are unlikely across a concave crease, where two objects or two parts touch.
+brightness. They are unlikely across a concave crease, sharp or rounded, where two objects or two parts touch.
 """
 
 import numpy as np
@@ -17,6 +17,7 @@ from refgs.train.material.observe import Seen
 REACH, LEAST_REACH = 3.75e-3, 30.0
 LINKED = 16
 BENT, CREASED = 0.35, 0.12  # largest angles between neighbours' normals, in radians: convex and concave
+HOLLOW = 1.7  # largest concave curvature, times the object's size: the visual hull and surfels round a crease where two things touch
 STEP = 0.5  # largest sine of the angle at which a neighbour lies off the surfel's plane
 SHADE = 1.0  # largest difference of the logarithms of the neighbours' mean radiances
 FRINGE = 1.0  # surfels with fewer pixels in all photos take no part
@@ -54,10 +55,26 @@ def laplacian(positions: Tensor, seen: Seen, near: Tensor) -> sparse.csr_matrix:
     angle = np.arccos((normal[one] * normal[other]).sum(axis=1).clip(-1, 1))
     concave = ((normal[other] - normal[one]) * apart).sum(axis=1) < 0
     off = (apart * normal[one]).sum(axis=1)
+    curvature = _concave(points, normal, near.numpy())
+    hollow = (curvature[one] + curvature[other]) / 2
     shade = (seen.mean.clamp_min(0) + 0.05 * seen.mean.mean() + 1e-6).log().double().numpy()
     differs = np.linalg.norm(shade[one] - shade[other], axis=1)
-    exponent = (angle / np.where(concave, CREASED, BENT)) ** 2 + (off / STEP) ** 2 + (differs / SHADE) ** 2
+    bent = (angle / np.where(concave, CREASED, BENT)) ** 2 + (hollow / HOLLOW) ** 2
+    exponent = bent + (off / STEP) ** 2 + (differs / SHADE) ** 2
     part = (seen.pixels > FRINGE).numpy()
     graph = sparse.coo_matrix((np.exp(-exponent) * part[one] * part[other], (one, other)), (count, count)).tocsr()
     graph = (graph + graph.T) / 2
     return sparse.diags(np.asarray(graph.sum(axis=1)).ravel()) - graph
+
+
+def _concave(points: np.ndarray, normals: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return how concave the surface is at each point, (N,): a normal curvature, times the size of all; 0 where it is convex.
+
+    It is the mean over neighbours `near` (N, K) whose `normals` (N, 3) are within a right angle, by least squares: on a sphere, normals
+    differ as points do, divided by the radius. Size is the points' root mean square distance from their mean.
+    """
+    apart, turned = points[near] - points[:, None], normals[near] - normals[:, None]
+    same = np.einsum("nka,na->nk", normals[near], normals) > 0
+    bends, squares = ((same * (each * apart).sum(axis=2)).sum(axis=1) for each in (turned, apart))
+    size = np.sqrt(points.var(axis=0).sum())
+    return np.maximum(-size * bends / np.maximum(squares, 1e-12), 0)
