@@ -8,7 +8,7 @@ import torch
 from refgs.model import cubemap
 from refgs.model.surfels import raw_metallic
 from refgs.render.mirrored_light import SIDE
-from refgs.train.material import gloss, highlights, metals
+from refgs.train.material import base_colors, gloss, highlights, metals
 from tests.makers.training import copied, do, put, trainer
 
 COMPARE, LEVEL = "compare highlights", "level base colours"
@@ -48,11 +48,16 @@ def dim(state, lamps, factor):
     state.learned["albedo"].data.copy_(color.clamp(0.02, 0.98).logit())
 
 
+def compared(state):
+    paint = metals._sure_kinds(state)[1]
+    return highlights.compare(state, base_colors.with_brighter_lamps(state, paint, highlights.BRIGHTER), 0)
+
+
 def test_lamps_that_are_too_dim_or_too_bright_are_noticed(start, tmp_path):
     state, lamps = shot(start, tmp_path / "run")
     for factor, before in ((1.0, 1.0), (0.5, 1.0), (2.0, 0.5)):
         dim(state, lamps, factor / before)
-        told = highlights.compare(state, 0)
+        told = compared(state)
         assert told.log == pytest.approx(-math.log(factor), abs=0.35)
         assert (abs(told.log) < 0.03) == (factor == 1), "the photos are the renderer's own"
 
@@ -61,7 +66,7 @@ def test_other_roughness_is_not_taken_for_other_lamps(start, tmp_path):
     state, _ = shot(start, tmp_path / "run")
     for roughness in (0.25, 0.37):
         state.learned["roughness"].data.fill_(torch.tensor(roughness).logit())
-        told = highlights.compare(state, 0)
+        told = compared(state)
         assert abs(told.log) < 0.2, roughness
 
 
@@ -79,7 +84,7 @@ def test_lamps_are_balanced_until_highlights_agree(start, tmp_path):
 
 
 def test_metal_tells_nothing(start, tmp_path):
-    assert highlights.compare(shot(start, tmp_path / "run", metallic=0.98)[0], 0) is None
+    assert compared(shot(start, tmp_path / "run", metallic=0.98)[0]) is None
 
 
 def learned(state, roughness):

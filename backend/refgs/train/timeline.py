@@ -317,7 +317,7 @@ AFTER = (
     Row("even coloured metal out", None, part(0.6), iterations(50)),
     Row("find glossy paint", part(0.4), RESIDUAL, share(0.085), clock="deciding", cost=13),
     Row("keep paint glossy", part(0.4), RESIDUAL, iterations(10)),
-    Row("compare highlights", part(0.3), RESIDUAL, share(1 / 50), clock="deciding", cost=2, most=SHAPES),
+    Row("compare highlights", part(0.3), RESIDUAL, share(1 / 25), clock="deciding", cost=4, most=SHAPES),
     Row("level base colours", until=RESIDUAL, every=iterations(10)),
     Row("draw metals' base colours", None, part(0.6), iterations(10)),
     Row("average paint's base colours", None, part(0.6), share(1 / 50)),

@@ -30,7 +30,7 @@ from refgs.color import srgb_decode
 from refgs.geometry.project import inside, project, sample
 from refgs.geometry.visibility import mirror
 from refgs.model import cubemap
-from refgs.model.environment import CLIPPED
+from refgs.model.environment import CLIPPED, Environment
 from refgs.model.surfels import Surfels
 from refgs.render.mirrored_light import SIDE
 from refgs.spread import spread
@@ -39,7 +39,7 @@ from refgs.train.material import same_material
 from refgs.train.material.highlights import Told
 from refgs.train.material.observe import neighbours
 from refgs.train.material.reckoning import Reckoned, principal_axis
-from refgs.train.state import State
+from refgs.train.state import RenderInputs, State
 
 DARKEST, BRIGHTEST = 0.02, 0.98  # base colours
 DRAWN = 0.3  # part of the way to the told base colour, each time
@@ -264,15 +264,35 @@ def _balance(state: State, paint: Tensor, hue: Tensor, mean: Tensor | None) -> T
     The mean of `paint` (N,) is drawn to `mean`, and the light as a whole to the `hue` (3,), logarithms. The smaller the part of lamps is,
     the less changes.
     """
-    radiance = state.method.light.radiance(state.learned["environment"])
-    area = cubemap.texel_solid_angles(math.isqrt(len(radiance) // 6))
-    power = radiance * area.to(radiance).view(-1, 1)
-    whole, lamps = power.sum(dim=0), radiance > CLIPPED
-    part = (power * lamps).sum(dim=0) / whole
+    radiance, whole, part = _lamps(state)
     change = 0.0 if mean is None else mean - _mean(state, paint)
     change = change + whole.log() - whole.log().mean() - hue
     step = part * (STEP * change).clamp(-MOST_STEP, MOST_STEP)
-    brighter = 1 + ((-step).exp() - 1) / part.clamp_min(1e-6)
     raw = state.learned["environment"]
-    raw.copy_(torch.where(lamps, state.method.light.raw(radiance * brighter), raw))
+    raw.copy_(torch.where(radiance > CLIPPED, state.method.light.raw(_brighter(radiance, part, -step)), raw))
     return step
+
+
+@torch.no_grad()
+def with_brighter_lamps(state: State, paint: Tensor, change: float) -> RenderInputs:
+    """Return what is rendered if `paint` (N,) is darker by `change`, a logarithm, and lamps are brighter, so that it looks the same."""
+    inputs = state.inputs()
+    radiance, _, part = _lamps(state)
+    surfels, light = inputs.surfels, inputs.light
+    albedo = torch.where(paint[:, None], math.exp(-change) * surfels.albedo, surfels.albedo)
+    light = Environment(_brighter(radiance, part, change), light.reference)
+    return inputs._replace(surfels=surfels._replace(albedo=albedo), environment=light)
+
+
+def _lamps(state: State) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the light's radiance (6·R², 3), its power, and the part of lamps, (3,) each."""
+    radiance = state.method.light.radiance(state.learned["environment"])
+    power = radiance * cubemap.texel_solid_angles(math.isqrt(len(radiance) // 6)).to(radiance).view(-1, 1)
+    whole = power.sum(dim=0)
+    return radiance, whole, (power * (radiance > CLIPPED)).sum(dim=0) / whole
+
+
+def _brighter(radiance: Tensor, part: Tensor, change: float | Tensor) -> Tensor:
+    """Make lamps brighter, so that the power of all light grows by `change`, a logarithm. Lamps have the `part` (3,) of it."""
+    growth = (torch.as_tensor(change).exp() - 1) / part.clamp_min(1e-6)
+    return torch.where(radiance > CLIPPED, radiance * (1 + growth), radiance)

@@ -188,7 +188,8 @@ def compare_highlights(state: State, step: Step) -> None:
     """Learn from highlights, and from experience, how bright paint is in the mean."""
     if _base_colors_kept(state):
         part, paint = state.part(Metals), _sure_kinds(state)[1]
-        part.mean = base_colors.wanted(state, paint, highlights.compare(state, step.done), part.mean)
+        brighter = base_colors.with_brighter_lamps(state, paint, highlights.BRIGHTER)
+        part.mean = base_colors.wanted(state, paint, highlights.compare(state, brighter, step.done), part.mean)
 
 
 @torch.no_grad()
