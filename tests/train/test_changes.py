@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from refgs.train.decide.materials import SHINES
+from refgs.train.material import changing_light
 from refgs.train.material.changes import change_seen
 from refgs.train.material.changing_light import explained
 from refgs.train.material.metals import Metals
@@ -75,6 +76,11 @@ def test_a_light_that_changes_explains_more_than_mirroring(made):
     state.change("light.frame", "world", "photos", "the photos do not tell")
     found = explanation(made)
     assert found.lit > 0.375 and found.lit - found.mirrored > 0.25
+    state.part(changing_light.ChangingLight).start(state)
+    near = neighbours(state.learned["position"].detach(), NEIGHBOURS)
+    assert changing_light.lead(state, near) == pytest.approx(changing_light.MOST)
+    show(made, metallic=6.0, roughness=0.5)
+    assert changing_light.lead(state, near) == pytest.approx(changing_light.MOST), "it is measured once"
 
 
 @pytest.mark.parametrize("roughness", [-1.0, 0.5])  # a sharp image of these lamps is clipped, which tells nothing

@@ -27,6 +27,7 @@ from refgs.train.learn.poses import Poses
 from refgs.train.learn.priors import Priors
 from refgs.train.learn.trace import TracedMesh
 from refgs.train.material import base_colors
+from refgs.train.material.changing_light import ChangingLight
 from refgs.train.material.metals import Metals
 from refgs.train.part import Part
 from refgs.train.photo import Photo
@@ -39,7 +40,7 @@ from refgs.train.timeline import Step
 HOLLOWS, OUTLINES = 30, 2
 
 PARTS: tuple[type[Part], ...] = (
-    Metals, Densification, Poses, Exposures, MirroredLight, TracedMesh, Coarse, Outlines, MeshNormals, Priors, Means,
+    Metals, ChangingLight, Densification, Poses, Exposures, MirroredLight, TracedMesh, Coarse, Outlines, MeshNormals, Priors, Means,
 )  # fmt: skip
 """The parts of a training that remember something, in the order in which a checkpoint restores them."""
 

@@ -16,13 +16,23 @@ from torch import Tensor
 
 from refgs.geometry.visibility import mirror
 from refgs.render.relight import sphere
-from refgs.train.material.observe import LEAST_PIXELS, LEAST_VIEWS, Observations, averaged, pooled
+from refgs.train.material.observe import (
+    LEAST_PIXELS,
+    LEAST_VIEWS,
+    Observations,
+    averaged,
+    observe_changes,
+    pooled,
+)
+from refgs.train.part import Part
+from refgs.train.state import State
 
 SURFELS = 3000  # surfels that are looked at, at most
 LEAST_SURFELS = 400  # fewer surfels tell nothing
 SMOOTHED = 32  # neighbours whose normals are averaged: those of single surfels are rough early in the training
 LOBES, SHARPNESS = 50, 10.0  # lobes of the mirrored direction, 0.3 radians wide: they cover the sphere
 RIDGE = 1e-3  # ridge, as a fraction of the columns' mean square
+MOST = 0.4  # fraction of the variance; a larger lead tells no more
 CELL = 0.15  # side of a grid's cells, in scene radii: models are fitted to half of the cells, tested on the others
 
 
@@ -39,6 +49,32 @@ class Explained(NamedTuple):
     lit: float
     mirrored: float
     both: float
+
+
+class ChangingLight(Part):
+    """Remember by how much a changing light explains more than mirroring, see `lead`. It is None before it was measured."""
+
+    name, saved = "changing light", ("lead",)
+    lead: Tensor | None = None
+
+    def start(self, state: State) -> None:
+        self.lead = None
+
+
+@torch.no_grad()
+def lead(state: State, near: Tensor) -> float:
+    """Measure by how much more of the variance a changing light explains than mirroring, 0 to MOST: one number for the whole object.
+
+    It is measured once: surfels learn some of what changes as their shape, so that a later figure tells less. `near` (N, K) are the nearest
+    surfels, themselves first.
+    """
+    part = state.part(ChangingLight)
+    if part.lead is None:
+        points = state.learned["position"].detach()
+        found = explained(observe_changes(state), points, near.to(state.device), state.capture.radius)
+        more = found.lit - found.mirrored
+        part.lead = torch.tensor(0.0 if math.isnan(more) else min(max(more, 0.0), MOST))
+    return float(part.lead)
 
 
 @torch.no_grad()

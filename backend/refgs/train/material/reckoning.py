@@ -14,37 +14,33 @@ from torch import Tensor
 
 from refgs.model.surfels import Surfels
 from refgs.train.learn import trace
-from refgs.train.material import mirrored, same_material
-from refgs.train.material.changing_light import explained
+from refgs.train.material import changing_light, mirrored, same_material
 from refgs.train.material.observe import (
     COLOURED,
     LEAST_PIXELS,
     NEIGHBOURS,
     Seen,
-    averaged,
     from_grey,
     neighbours,
-    observe_changes,
     pooled,
 )
 from refgs.train.state import State, why_not_traced
 
 WEIGHTS = {
-    "fall": 5.94,
-    "fall of changes": 0.74,
-    "light's fall": -2.42,
-    "ratio": 3.57,
-    "reflectance": 8.28,
-    "object's ratio": 2.04,
-    "object's reflectance": 2.74,
-    "tint": 2.29,
-    "grey": 2.70,
-    "changing light": -33.78,
+    "fall": 6.16,
+    "light's fall": -1.85,
+    "ratio": 3.66,
+    "reflectance": 8.03,
+    "object's ratio": 2.46,
+    "object's reflectance": 3.02,
+    "tint": 2.10,
+    "grey": 2.35,
+    "changing light": -35.61,
 }
-BIAS = -6.3
+BIAS = -5.85
 LOW = 0.1  # quantile over the photos
 DARKEST = 1e-4  # radiance: photos tell no darker ones apart
-MOST_FALL, MOST_RATIO, MOST_CHANGE = 2.5, 1.5, 0.4  # terms that are larger tell no more
+MOST_FALL, MOST_RATIO = 2.5, 1.5  # terms that are larger tell no more
 ENOUGH_PIXELS = 30.0  # the neighbours' pixels in all photos from which on what they mirror of the object tells
 LEAST_SHOWN = 0.02  # least mean radiance of what a surfel mirrors of the object: in less, errors tell more
 CHANGES = 0.15  # relative change from which on its colour tells fully
@@ -98,7 +94,8 @@ def reckon(state: State) -> Reckoned:
     fits = mirrored.fit_both(seen, rays, near)
     graph = same_material.laplacian(surfels.positions, seen, near)
     shown, changes = mean_and_changes(seen, near)
-    values = terms(seen, fits, near, shown, changes) | terms_of_changes(state, near)
+    values = terms(seen, fits, near, shown, changes)
+    values["changing light"] = torch.full_like(seen.pixels, changing_light.lead(state, near))
     every, of_object = fits.everywhere, fits.of_object
     known = (seen.pixels > same_material.FRINGE) & (every.pixels > ENOUGH_PIXELS) & (every.exact > LEAST_PIXELS)
     metal = same_material.spread(graph, log_odds(values), known.float()).sigmoid()
@@ -129,6 +126,8 @@ def terms(seen: Seen, fits: mirrored.Mirrored, near: Tensor, shown: Tensor, chan
     - ratio, reflectance: see `mirrored.Fit`, by the light and, as "object's …", by photos in which the surfel mirrors the object
     - tint: whether the radiance changes along the surface's own colour (1), as a coloured metal's, or along grey (0)
     - grey: 1 where the surface has no colour, so that its tint tells nothing
+
+    One more, "changing light", is a number for the whole object (`changing_light.lead`).
     """
     every, of_object = fits.everywhere, fits.of_object
     met = of_object.pixels > ENOUGH_PIXELS
@@ -147,20 +146,11 @@ def terms(seen: Seen, fits: mirrored.Mirrored, near: Tensor, shown: Tensor, chan
 
 def _fall(radiance: Tensor, seen: Seen, near: Tensor) -> Tensor:
     """Compute how far below its median each surfel's `radiance` (N, V) falls in a tenth of the photos: a logarithm (N,), at least 0."""
-    radiance = radiance.masked_fill(seen.weight <= 0, math.nan)
-    levels = _low_and_median(radiance).T
+    radiance = radiance.masked_fill(seen.weight <= 0, math.nan)  # NaN: a photo that does not show it
+    levels = radiance.nanquantile(radiance.new_tensor([LOW, 0.5]), dim=1).nan_to_num().T
     pixels = seen.pixels[:, None]
     low, median, total = pooled(torch.cat([levels * pixels, pixels], dim=1), near).unbind(dim=1)
-    total = total.clamp_min(1e-6)
-    return _log_ratio(median / total, low / total)
-
-
-def _low_and_median(radiance: Tensor) -> Tensor:
-    """Return the quantiles LOW and 1/2 of `radiance` (N, V) over the photos, (2, N). NaN stands for a photo that does not show it."""
-    return radiance.nanquantile(radiance.new_tensor([LOW, 0.5]), dim=1).nan_to_num()
-
-
-def _log_ratio(median: Tensor, low: Tensor) -> Tensor:
+    low, median = (level / total.clamp_min(1e-6) for level in (low, median))
     return (median.clamp_min(DARKEST) / low.clamp_min(DARKEST)).log().clamp(0, MOST_FALL)
 
 
@@ -204,25 +194,6 @@ def _tint(mean: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
     size = covariance.diagonal(dim1=1, dim2=2).mean(dim=1).sqrt()
     coloured = (colour > COLOURED).float()
     return coloured * along.clamp(-0.5, 1.5) * (size / CHANGES).clamp(0, 1), 1 - coloured
-
-
-def terms_of_changes(state: State, near: Tensor) -> dict[str, Tensor]:
-    """Compute the terms (N,) that compare photos with a model in which each surfel looks the same from everywhere (`observe_changes`).
-
-    - fall of changes: as fall, without what neighbours and background add to a surfel's pixels, and without what is seen at grazing angles
-    - changing light: how much better a light that differs between photos explains all changes than mirroring does. It is one number for
-      the whole object.
-    """
-    seen, near = observe_changes(state), near.to(state.device)
-    changes = explained(seen, state.learned["position"].detach(), near, state.capture.radius)
-    mean, change, known = (each.cpu() for each in averaged(seen, near))
-    shown = (mean[:, None] + change).mean(dim=2).clamp_min(0).masked_fill(~known, math.nan)
-    low, median = _low_and_median(shown)
-    changing = max(0.0, changes.lit - changes.mirrored) if changes.lit >= 0 else 0.0  # NaN: nothing is known
-    return {
-        "fall of changes": _log_ratio(median, low),
-        "changing light": torch.full_like(low, min(changing, MOST_CHANGE)),
-    }
 
 
 def like_metals(found: Reckoned) -> Tensor:
