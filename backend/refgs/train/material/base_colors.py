@@ -51,6 +51,7 @@ LIKE = 1.0  # neighbours whose logarithms differ by more have colours of their o
 PAINT = 0.34  # all paint's brightest channel in the mean, as far as highlights do not tell, at most: the median of 34 rendered scenes
 PAINTS = 0.66  # standard deviation of its natural logarithm in 21 rendered scenes
 HUES = 0.13  # standard deviation of the logarithms of a light's hue: Blender's eight HDRIs have this
+PARTS_HUES = 0.1  # the same of what highlights show of a light, around the hue of all of it: 18 rendered scenes
 LEAST_MIRRORED = 2.0  # pixels that must mirror a texel of the coarse cubemap, so that they tell its radiance
 STEP, MOST_STEP = 0.3, 0.1  # part of the way to balance, each time, and the largest step: logarithms
 TOWARDS = 0.4  # part of the way to what highlights tell, each time that they are compared
@@ -123,7 +124,8 @@ def told_hue(found: Reckoned, paint: Tensor) -> Tensor:
     """Tell the hue of the light from highlights of `paint` (N,): natural logarithms (3,), whose sum is 0.
 
     A dielectric's highlight has the light's colour (Shafer 1985), so the radiance of paint changes from photo to photo along that colour.
-    The more a surfel changes, the more it counts. The wider the surfels differ, the less their median is trusted against grey.
+    The more a surfel changes, the more it counts. The wider the surfels differ, the less their median is trusted against grey. All may
+    agree and be wrong: a board mirrors one part of a room.
     """
     axis, change = principal_axis(found.changes)
     weight = found.pixels * paint * found.known * change * (axis > 0).all(dim=1)
@@ -133,7 +135,7 @@ def told_hue(found: Reckoned, paint: Tensor) -> Tensor:
     logs = logs - logs.mean(dim=1, keepdim=True)
     hue = _median(logs, weight)
     spread = 1.4826 * _median((logs - hue).abs(), weight)  # standard deviation, if the distribution is normal
-    hue = hue * HUES**2 / (HUES**2 + spread.square().mean())
+    hue = hue * HUES**2 / (HUES**2 + PARTS_HUES**2 + spread.square().mean())
     return hue - hue.mean()
 
 
