@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from refgs.color import srgb_decode
@@ -45,6 +46,11 @@ class Rendering:
         mean = (self.color - (1 - alpha) * self.background) / alpha.clamp_min(COVERED)
         radiance = srgb_decode(mean.clamp_min(0)) * (alpha > COVERED)
         return radiance if self.exposure is None else radiance / self.exposure
+
+    @property
+    def mirrors_light(self) -> Tensor:
+        """Tell in which pixels (H, W) the object does not occlude the mirror direction: all without inter-reflection."""
+        return torch.ones_like(self.alpha).bool() if self.visibility is None else self.visibility > 0.5
 
     @property
     def albedo(self) -> Tensor:

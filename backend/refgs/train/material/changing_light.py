@@ -16,14 +16,7 @@ from torch import Tensor
 
 from refgs.geometry.visibility import mirror
 from refgs.render.relight import sphere
-from refgs.train.material.observe import (
-    LEAST_PIXELS,
-    LEAST_VIEWS,
-    Observations,
-    averaged,
-    observe_changes,
-    pooled,
-)
+from refgs.train.material.observe import LEAST_PIXELS, LEAST_VIEWS, Observations, averaged, observe_changes, pooled
 from refgs.train.part import Part
 from refgs.train.state import State
 

@@ -20,7 +20,6 @@ from refgs.train.material import base_colors
 from refgs.train.material.observe import LEAST_PIXELS, neighbours, pooled
 from refgs.train.state import RenderInputs, State
 
-VIEWS = 12  # photos that are compared at a time
 NEAR = 9  # neighbours whose radiance is averaged, so that noise of pixels does not count
 GLOSSIER = 0.5  # factor on roughness in the second rendering, which tells how the variance depends on it
 LEAST = 0.2  # roughness; glossier paint learns by itself
@@ -42,7 +41,7 @@ def roughest(state: State, paint: Tensor, seed: int) -> Tensor:
     learned = inputs.surfels.roughness
     other = base_colors.plausible(torch.where(paint, GLOSSIER * learned, learned))
     glossier = inputs._replace(surfels=inputs.surfels._replace(roughness=other))
-    views = probe.random_views(state, seed, VIEWS)
+    views = probe.random_views(state, seed, probe.SEVERAL)
     sums = torch.stack([_sums(state, view, inputs, glossier) for view in views], dim=1)
     photo, shown, other = (_variances(inputs.surfels, sums, paint) + DARK).log().unbind(dim=1)
     slope = ((other - shown) / -math.log(GLOSSIER)).clamp_min(0)
@@ -60,9 +59,7 @@ def _sums(state: State, view: int, *inputs: RenderInputs) -> Tensor:
     shown = [probe.picture(state, view, each) for each in inputs]
     pictures = photo.encoded, *(each.color for each in shown)
     grey = [srgb_decode(picture.clamp(0, 1)).mean(dim=-1) for picture in pictures]
-    images = torch.stack([*grey, torch.ones_like(grey[0])], dim=-1)
-    if (visibility := shown[0].visibility) is not None:
-        images = images * (visibility > 0.5)[..., None]
+    images = torch.stack([*grey, torch.ones_like(grey[0])], dim=-1) * shown[0].mirrors_light[..., None]
     features = torch.ones_like(surfels.positions[:, :1]).expand(-1, images.shape[-1])
     return pixel_sums(surfels, photo.camera, state.near, features, lambda _: images)
 

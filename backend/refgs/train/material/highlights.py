@@ -69,13 +69,9 @@ def _light(photo: Photo, shown: Rendering, brighter: Rendering, matte: Rendering
     """Sum the light of highlights of paint: (3,), in the photo and in the renderings `shown` and `brighter`."""
     pictures = photo.encoded, shown.color, brighter.color, matte.color, matte_brighter.color
     seen, *rendered, base, other = (srgb_decode(x.clamp(0, 1)) for x in pictures)
-    paint = shown.alpha > OPAQUE
-    if shown.material is not None:
-        paint &= (shown.material[..., 3] < METALLIC) & (shown.material[..., 4] < GLOSSY)
+    paint = (shown.alpha > OPAQUE) & (shown.metallic < METALLIC) & (shown.roughness < GLOSSY) & shown.mirrors_light
     if photo.mask is not None:
         paint &= photo.mask > 255 * OPAQUE
-    if shown.visibility is not None:
-        paint &= shown.visibility > 0.5
     highlights = [
         (light - dull).mean(dim=-1) for light, dull in zip((seen, *rendered), (base, base, other), strict=True)
     ]
