@@ -139,22 +139,39 @@ def test_of_two_objects_the_one_that_the_cameras_look_at(tmp_path, monkeypatch, 
     assert np.mean(overlap(made, alone if aimed else both)) > 0.9
 
 
+def whole_photos(folder):
+    """Photograph a ball. Return the capture's photos, with the true masks as `salient`, and the guessed box."""
+    truths = photograph(folder)
+    capture = read_capture(folder)
+    photos = [
+        silhouettes.Photo(
+            load_view(view, 96).bytes, view.camera.resized(*SIZE), np.zeros(SIZE[::-1], np.int8),
+            np.float32(truths[int(view.image_path.stem)]),
+        )
+        for view in capture.views
+    ]  # fmt: skip
+    return photos, masks.guess_box(capture, capture.views)[0]
+
+
 def test_the_box_is_around_what_the_model_finds(tmp_path):
     """Check a guessed box that cuts the ball, and one in which the ball is small."""
-    truths = photograph(tmp_path)
-    views = read_capture(tmp_path).views
-    found = []
-    for scale in (0.7, 4.0):
-        photos = [
-            silhouettes.Photo(
-                load_view(view, 96).bytes, view.camera.resized(*SIZE), np.zeros(SIZE[::-1], np.int8),
-                np.float32(truths[int(view.image_path.stem)]),
-            )
-            for view in views
-        ]  # fmt: skip
-        guessed = masks.guess_box(read_capture(tmp_path), views)[0]
-        found.append(silhouettes.find_box(photos, Box(guessed.matrix @ np.diag([scale, scale, scale, 1.0]))))
+    photos, guessed = whole_photos(tmp_path)
+    found = [
+        silhouettes.find_box(photos, Box(guessed.matrix @ np.diag([scale, scale, scale, 1.0]))) for scale in (0.7, 4.0)
+    ]
     assert found[0].matrix == pytest.approx(found[1].matrix, abs=0.25 * found[0].radius)
+
+
+def test_photos_in_which_the_model_finds_nothing_do_not_cut_the_object(tmp_path):
+    """Check that the box holds all of a ball, though four of ten photos, which show its upper half, show nothing to the model."""
+    photos, guessed = whole_photos(tmp_path)
+    whole, upper = silhouettes.find_box(photos, guessed), slice(0, SIZE[1] // 2)
+    for i in (0, 3, 5, 8):
+        image = photos[i].image[upper]
+        camera = photos[i].camera.cropped(0, 0, *image.shape[1::-1])
+        nothing = np.zeros(image.shape[:2])
+        photos[i] = silhouettes.Photo(image, camera, nothing.astype(np.int8), nothing.astype(np.float32))
+    assert silhouettes.find_box(photos, guessed).matrix == pytest.approx(whole.matrix, abs=0.1 * whole.radius)
 
 
 @pytest.mark.skipif(not INSTALLED.is_file(), reason="no segmentation model: python scripts/fetch_model.py")

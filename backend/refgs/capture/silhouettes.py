@@ -107,7 +107,7 @@ def carve_object(photos: list[Photo], box: Box, fill: float, backdrop: Backdrop 
     pixels, seen, enough = _find_pixels(points, photos)
     allowed = enough if backdrop is None else enough & backdrop.before(points)
     if any(photo.salient is not None for photo in photos):
-        occupied = np.clip(_by_model(photos, pixels, seen, enough), 0, 0.85)
+        occupied = np.clip(_by_model(photos, pixels, enough), 0, 0.85)
     else:
         occupied = np.clip(1.3 - 1.25 * _off_centre(points, box) / fill, 0.0, 0.85)
     occupied[~allowed] = 0
@@ -158,7 +158,8 @@ def find_box(photos: list[Photo], box: Box) -> Box:
     for _ in range(2):  # the second time with voxels of the object's size
         wide = Box(box.matrix @ np.diag([WIDER, WIDER, WIDER, 1.0]))
         points = wide.grid(GRID)
-        likely = _by_model(photos, *_find_pixels(points, photos))
+        pixels, _, enough = _find_pixels(points, photos)
+        likely = _by_model(photos, pixels, enough)
         parts, count = cast(tuple[np.ndarray, int], label(likely.reshape(GRID, GRID, GRID) > 0.5))
         if count == 0:
             return box
@@ -198,18 +199,28 @@ def _find_pixels(points: np.ndarray, photos: list[Photo]) -> tuple[list[np.ndarr
     return pixels, seen, seen >= max(2, SEEN * len(photos))
 
 
-def _by_model(photos: list[Photo], pixels: list[np.ndarray], seen: np.ndarray, enough: np.ndarray) -> np.ndarray:
+def _by_model(photos: list[Photo], pixels: list[np.ndarray], enough: np.ndarray) -> np.ndarray:
     """Return the probability (GRID³,) that voxels are in the object, by the model alone.
 
-    `pixels`, `seen` and `enough` are the results of `_find_pixels`.
+    `pixels` and `enough` are results of `_find_pixels`. The model may take something else in some photos, or nothing. So each photo counts
+    as far as what it takes holds what all photos agree on.
     """
-    total = np.zeros(len(seen))
-    for photo, at in zip(photos, pixels, strict=True):
-        if photo.salient is not None:
-            total[at >= 0] += photo.salient.ravel()[at[at >= 0]]
-    mean = np.where(enough, total / np.maximum(seen, 1), 0)
-    # Relative to the largest mean: in some photos the model may take something else.
-    return np.clip((mean / max(mean.max(), 1e-6) - 0.6) / 0.4, 0, 1)
+    shown = [
+        (at >= 0, photo.salient.ravel()[at[at >= 0]])
+        for photo, at in zip(photos, pixels, strict=True)
+        if photo.salient is not None
+    ]
+
+    def agreed(counts: np.ndarray) -> np.ndarray:
+        total, whole = np.zeros((2, len(enough)))
+        for (here, salient), count in zip(shown, counts, strict=True):
+            total[here] += count * salient
+            whole[here] += count
+        mean = np.where(enough, total / np.maximum(whole, 1e-6), 0)
+        return np.clip((mean / max(mean.max(), 1e-6) - 0.6) / 0.4, 0, 1)
+
+    first = agreed(np.ones(len(shown)))
+    return agreed(np.array([first[here] @ salient / max(first[here].sum(), 1e-6) for here, salient in shown]))
 
 
 def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
