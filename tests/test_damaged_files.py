@@ -60,7 +60,7 @@ def failures(found: list[dict]) -> list[dict]:
 
 
 def test_damaged_files_are_read_or_refused_in_one_line(tmp_path):
-    found = found_in(tmp_path, 5_000, "a seed")
+    found = found_in(tmp_path, 2_000, "a seed")
     assert {facts["reader"] for facts in found if "tries" in facts} == {*READERS}
     assert not failures(found)
 

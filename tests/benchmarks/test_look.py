@@ -40,6 +40,7 @@ def made(ball_capture, tmp_path):
     return scene.parent, folder.parent
 
 
+@pytest.mark.slow
 def test_a_run_that_is_the_truth(made, tmp_path, monkeypatch):
     monkeypatch.setattr(look, "VIEWS", 1)  # Eevee in software takes seconds a picture
     scenes, runs = made

@@ -286,6 +286,7 @@ def test_the_passes_show_the_textures(name, tmp_path):
             assert np.abs(found - np.median(found, axis=0)).mean() > 0.005
 
 
+@pytest.mark.slow
 def test_a_small_part_of_the_pig_is_chrome(tmp_path):
     """Check that the bell takes one to three hundredths of the pixels, in the mean over views, and that nothing else is metal."""
     pytest.importorskip("bpy")

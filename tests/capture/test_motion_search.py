@@ -207,6 +207,7 @@ def placed_one_by_one(folder: Path) -> int:
     return colmap_steps.map_one_by_one(photos, database, lambda *_: None)[0].num_reg_images()
 
 
+@pytest.mark.slow
 def test_many_photos_in_any_order(tmp_path):
     """Check that photos are matched with those that look like them, where these are too many for all pairs and names say nothing.
 
