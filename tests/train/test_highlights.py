@@ -49,7 +49,7 @@ def dim(state, lamps, factor):
 
 
 def compared(state):
-    paint = metals._sure_kinds(state)[1]
+    paint = metals._told_kinds(state)[1]
     return highlights.compare(state, base_colors.with_brighter_lamps(state, paint, highlights.BRIGHTER), 0)
 
 

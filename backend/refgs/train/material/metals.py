@@ -1,8 +1,8 @@
 """Set surfels' metallic values by what photos tell (see `reckoning`).
 
 Paint explains photos of a rough or embossed metal about as well as metal does, and black paint those of a mirror in the dark. Training
-starts near paint, so it would stay there. So whether a surfel is metal is reckoned from the photos after a tenth of the training, and again
-at some new meshes. Where photos are sure, metallic values do not learn in between.
+starts near paint, so it would stay there. So whether a surfel is metal is reckoned from the photos early in the training, and again at
+some new meshes. Metallic values do not learn in between.
 """
 
 from collections.abc import Mapping
@@ -18,10 +18,7 @@ from refgs.train.part import Fact, Part
 from refgs.train.state import State
 from refgs.train.timeline import Step, metals_decidable
 
-GIVEN = Kinds(metal=0.9, paint=0.02)  # metallic that is set where photos are not sure; training can still change it
 HELD = Kinds(metal=0.98, paint=0.002)  # metallic that does not learn, in the order of `hints.KINDS`
-LIKELY = 1 - questions.DOUBTFUL / 2  # probability of metal, or of paint, from which on metallic is set
-SURE = 0.95  # probability from which on it does not learn
 SHARP = Kinds(metal=0.1, paint=gloss.LEAST)  # roughness from which surfels learn, at most, once metals are found
 TOLD = 0.005  # a change of a larger fraction of the surface is announced
 
@@ -29,10 +26,10 @@ TOLD = 0.005  # a change of a larger fraction of the surface is announced
 class Metals(Part):
     """Remember whether metals have already been `found`.
 
-    Of each surfel, remember whether hints hold its kind (`held`), whether photos are sure of it (`told`), how rough it is at most
+    Of each surfel, remember whether hints hold its kind (`held`), whether photos tell it (`told`), how rough it is at most
     (`roughest`, see `gloss`), and the base colour that it keeps to (`shown_color`): of metal, what photos tell of it (see
     `base_colors.told`), and of paint, what it had learned when its shades were first kept. Checkpoints also keep `state.told_light`. It is
-    None unless photos tell base colours of some metals that are sure; without masks, they never do. `hue` (3,) is the light's
+    None unless photos tell base colours of some metals; without masks, they never do. `hue` (3,) is the light's
     (`base_colors.told_hue`), and `mean` is that of paint (`base_colors.wanted`).
     """
 
@@ -78,7 +75,9 @@ def judge(state: State, step: Step) -> None:
 
 @torch.no_grad()
 def _judge(state: State, first: bool = False) -> None:
-    """Set metallic to the kind that photos tell. It does not learn where they are sure, or where a hint holds it.
+    """Set metallic to the likelier kind, and hold it there until the next look. Hints hold theirs. It learns where no photo tells.
+
+    It does not learn where photos leave doubt, either: training turns metal into paint, by changing the light.
 
     A surfel that was taken for paint, but is metal, takes the base colour and roughness of the metals around it. An example is the lower
     half of a ball on a table: it mirrors only the table, so it has learned the table's colour as its own. The first time, all metals take
@@ -89,32 +88,31 @@ def _judge(state: State, first: bool = False) -> None:
     metallic, albedo, roughness = (state.learned[name] for name in names)
     free, likely = ~state.learned["held"], found.metal.to(metallic.device)
     was = state.surfels().metallic > 0.5
-    raised, lowered = free & ~was & (likely > LIKELY), free & was & (likely < 1 - LIKELY)
-    metal, paint = free & (likely > SURE), free & (likely < 1 - SURE)
-    metallic[raised], metallic[lowered] = raw_metallic(GIVEN.metal), raw_metallic(GIVEN.paint)
+    metal, paint = free & (likely > 0.5), free & (likely < 0.5)
+    raised, lowered = metal & ~was, paint & was
     metallic[metal], metallic[paint] = raw_metallic(HELD.metal), raw_metallic(HELD.paint)
     state.learned["told"].copy_(metal | paint)
     shown = state.learned["shown_color"]
-    sure, painted = (kind.cpu() for kind in _sure_kinds(state))
-    shown.copy_(base_colors.told(found, sure) * sure[:, None])  # paint keeps to its own
-    state.part(Metals).hue = base_colors.told_hue(found, painted).to(state.device)
+    metal, paint = (kind.cpu() for kind in _told_kinds(state))
+    shown.copy_(base_colors.told(found, metal) * metal[:, None])  # paint keeps to its own
+    state.part(Metals).hue = base_colors.told_hue(found, paint).to(state.device)
     colored = state.from_hull and bool(shown.any())
-    state.told_light = base_colors.told_light(found, sure).to(state.device) if colored else None
+    state.told_light = base_colors.told_light(found, metal).to(state.device) if colored else None
     if raised.any():
         material = torch.logit(base_colors.plausible(like_metals(found))).to(metallic.device)
         albedo[raised], roughness[raised] = material[raised, :3], material[raised, 3]
     if first:
         # The first light is blurred. A surfel that became rough under it would stay so: it spreads a lamp's highlight to where photos show
         # none, so that it becomes rougher still. One that is too sharp learns.
-        fresh = likely > LIKELY
+        fresh = likely > 0.5
         roughness.copy_(roughness.minimum(torch.where(fresh, SHARP.metal, SHARP.paint).logit()))
         state.learned.forget("roughness", fresh)
-        fresh = _sure_kinds(state)[0] & (shown[:, 3] > 0)
+        fresh = _told_kinds(state)[0] & (shown[:, 3] > 0)
         albedo[fresh] = torch.logit(shown[fresh, :3])
         state.learned.forget("albedo", fresh)
     for name in names:
         state.learned.forget(name, raised | lowered)
-    state.learned.forget("metallic", metal | paint)
+    state.learned.forget("metallic", state.learned["told"])
     now = state.surfels()
     whole = max(float(found.pixels.sum()), 1e-6)
     kinds = now.metallic > 0.5, raised, lowered
@@ -174,20 +172,20 @@ def hold_as(state: State, kinds: torch.Tensor) -> None:
 def draw_metals(state: State, step: Step) -> None:
     """Draw base colours of metals to what photos tell."""
     if _base_colors_kept(state):
-        base_colors.draw(state, _sure_kinds(state)[0])
+        base_colors.draw(state, _told_kinds(state)[0])
 
 
 def level_base_colors(state: State, step: Step) -> None:
     """Keep mean base colours, and with them lamps, at what photos and experience tell, see `base_colors`."""
     part = state.part(Metals)
     if _base_colors_kept(state):
-        base_colors.level(state, *_sure_kinds(state), part.hue, part.mean)
+        base_colors.level(state, *_told_kinds(state), part.hue, part.mean)
 
 
 def compare_highlights(state: State, step: Step) -> None:
     """Learn from highlights, and from experience, how bright paint is in the mean."""
     if _base_colors_kept(state):
-        part, paint = state.part(Metals), _sure_kinds(state)[1]
+        part, paint = state.part(Metals), _told_kinds(state)[1]
         brighter = base_colors.with_brighter_lamps(state, paint, highlights.BRIGHTER)
         part.mean = base_colors.wanted(state, paint, highlights.compare(state, brighter, step.done), part.mean)
 
@@ -196,7 +194,7 @@ def compare_highlights(state: State, step: Step) -> None:
 def find_glossy_paint(state: State, step: Step) -> None:
     """Tell how rough paint is at most, see `gloss`."""
     if _gloss_learns(state):
-        state.learned["roughest"].copy_(gloss.roughest(state, _sure_kinds(state)[1], step.done))
+        state.learned["roughest"].copy_(gloss.roughest(state, _told_kinds(state)[1], step.done))
 
 
 @torch.no_grad()
@@ -210,13 +208,13 @@ def keep_paint_glossy(state: State, step: Step) -> None:
 def average_paint(state: State, step: Step) -> None:
     """Average base colours of paint over neighbours, so that the light learns shades, and not the paint."""
     if _base_colors_kept(state):
-        base_colors.average(state, _sure_kinds(state)[1])
+        base_colors.average(state, _told_kinds(state)[1])
 
 
 def keep_shades(state: State, step: Step) -> None:
     """Keep shades of base colours, so that only what is finer learns."""
     if _base_colors_kept(state):
-        base_colors.keep_shades(state, *_sure_kinds(state))
+        base_colors.keep_shades(state, *_told_kinds(state))
 
 
 def _base_colors_kept(state: State) -> bool:
@@ -228,14 +226,14 @@ def _gloss_learns(state: State) -> bool:
     return {"roughness", "roughest"} <= state.learned.keys()
 
 
-def _sure_kinds(state: State) -> tuple[torch.Tensor, torch.Tensor]:
-    """Tell which surfels (N,) are metal, and which are paint, by hints or because photos are sure."""
-    sure, metal = state.learned["held"] | state.learned["told"], state.learned["metallic"] > raw_metallic(0.5)
-    return sure & metal, sure & ~metal
+def _told_kinds(state: State) -> tuple[torch.Tensor, torch.Tensor]:
+    """Tell which surfels (N,) are metal, and which are paint, by hints or because photos tell."""
+    known, metal = state.learned["held"] | state.learned["told"], state.learned["metallic"] > raw_metallic(0.5)
+    return known & metal, known & ~metal
 
 
 def hold(state: State) -> None:
-    """Zero the gradient of metallic values where hints hold them, or photos are sure."""
+    """Zero the gradient of metallic values where hints hold them, or photos tell them."""
     metallic = state.learned.get("metallic")
     if metallic is not None and metallic.grad is not None:
         metallic.grad.masked_fill_(state.learned["held"] | state.learned["told"], 0)
