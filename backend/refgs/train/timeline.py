@@ -60,6 +60,10 @@ class When(NamedTuple):
         words = f"{self.words}, {other.words}"
         return When(words, lambda state, step: self.holds(state, step) and other.holds(state, step))
 
+    def __or__(self, other: "When") -> "When":
+        words = f"{self.words} or {other.words}"
+        return When(words, lambda state, step: self.holds(state, step) or other.holds(state, step))
+
 
 class Every(NamedTuple):
     """Hold a period in iterations, 0 for never, and its `words` for docs/timeline.md."""
@@ -308,11 +312,23 @@ AFTER = (
     Row("trace what surfels receive", only_if=NEW_MESH, clock="visibility"),
     DECIDE("time the crops", iteration(100), cost=6),
     DECIDE("look at a matte scene again", HALFWAY, cost=60),
-    DECIDE("decide on specular shading", iteration_after_initial(100), cost=60),
+    DECIDE(
+        "decide on specular shading",
+        iteration_after_initial(100) & (FROM_HULL | part_after_initial(0.05)),
+        cost=60,
+    ),
     DECIDE("decide on the light's texels", part_after_initial(0.19), cost=40),
     DECIDE("decide on degrees of harmonics", LATE, cost=40),
-    # The longer the light learns from things that are all taken for paint, the more it explains metals as paint, too.
-    DECIDE("find metals", iteration_after_initial(150), RESIDUAL, only_if=METALS, cost=180, most=SHAPES),
+    # The longer the light learns from things that are all taken for paint, the more it explains metals as paint, too. But without masks,
+    # surfels take long to lie on the surface.
+    DECIDE(
+        "find metals",
+        iteration_after_initial(150) & (FROM_HULL | part_after_initial(0.1)),
+        RESIDUAL,
+        only_if=METALS,
+        cost=180,
+        most=SHAPES,
+    ),
     Row(
         "judge metals",
         until=RESIDUAL,
