@@ -129,12 +129,6 @@ def iteration(number: int) -> When:
     return When(f"iteration {number}", lambda state, step: step.done >= number)
 
 
-def iteration_after_initial(number: int) -> When:
-    """Return the time when `number` iterations are done after the initial stage."""
-    words = f"`initial.until` + {number} iterations"
-    return When(words, lambda state, step: step.done - state.settings.initial.until * state.total >= number)
-
-
 def setting(key: str) -> When:
     """Return the time that the setting `key`, "section.name", gives as a fraction of the training."""
     section, name = key.split(".")
@@ -312,18 +306,14 @@ AFTER = (
     Row("trace what surfels receive", only_if=NEW_MESH, clock="visibility"),
     DECIDE("time the crops", iteration(100), cost=6),
     DECIDE("look at a matte scene again", HALFWAY, cost=60),
-    DECIDE(
-        "decide on specular shading",
-        iteration_after_initial(100) & (FROM_HULL | part_after_initial(0.05)),
-        cost=60,
-    ),
+    DECIDE("decide on specular shading", part_after_initial(0.05) & iteration(100), cost=60),
     DECIDE("decide on the light's texels", part_after_initial(0.19), cost=40),
     DECIDE("decide on degrees of harmonics", LATE, cost=40),
     # The longer the light learns from things that are all taken for paint, the more it explains metals as paint, too. But without masks,
     # surfels take long to lie on the surface.
     DECIDE(
         "find metals",
-        iteration_after_initial(150) & (FROM_HULL | part_after_initial(0.1)),
+        part_after_initial(0.05) & iteration(150) & (FROM_HULL | part_after_initial(0.1)),
         RESIDUAL,
         only_if=METALS,
         cost=180,

@@ -26,7 +26,9 @@ class Specular(Need):
 
     name, what, shown = "specular", "specular shading", True
     threshold = 0.3  # dB
-    reason = "after 100 iterations matte clay has none; a polished plate has 0.8 dB, glossy paint 2.6, a mirror 5.6"
+    reason = (
+        "at a twentieth of a training matte clay has none; a polished plate has 0.8 dB, glossy paint 2.6, a mirror 5.6"
+    )
     moments = ("start", "specular")
 
     def due(self, state: State, moment: Moment) -> bool:
