@@ -206,7 +206,7 @@ def _by_model(photos: list[Photo], pixels: list[np.ndarray], enough: np.ndarray)
     as far as what it takes holds what all photos agree on.
     """
     shown = [
-        (at >= 0, photo.salient.ravel()[at[at >= 0]])
+        (here := at >= 0, photo.salient.ravel()[at[here]])
         for photo, at in zip(photos, pixels, strict=True)
         if photo.salient is not None
     ]
@@ -217,6 +217,7 @@ def _by_model(photos: list[Photo], pixels: list[np.ndarray], enough: np.ndarray)
             total[here] += count * salient
             whole[here] += count
         mean = np.where(enough, total / np.maximum(whole, 1e-6), 0)
+        # Relative to the largest mean: in some photos the model may take something else.
         return np.clip((mean / max(mean.max(), 1e-6) - 0.6) / 0.4, 0, 1)
 
     first = agreed(np.ones(len(shown)))

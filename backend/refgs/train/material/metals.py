@@ -84,8 +84,7 @@ def _judge(state: State, first: bool = False) -> None:
     the base colour that photos tell.
     """
     found = reckon(state)
-    names = "metallic", "albedo", "roughness"
-    metallic, albedo, roughness = (state.learned[name] for name in names)
+    metallic, albedo, roughness = (state.learned[name] for name in ("metallic", "albedo", "roughness"))
     free, likely = ~state.learned["held"], found.metal.to(metallic.device)
     was = state.surfels().metallic > 0.5
     metal, paint = free & (likely > 0.5), free & (likely < 0.5)
@@ -93,11 +92,11 @@ def _judge(state: State, first: bool = False) -> None:
     metallic[metal], metallic[paint] = raw_metallic(HELD.metal), raw_metallic(HELD.paint)
     state.learned["told"].copy_(metal | paint)
     shown = state.learned["shown_color"]
-    metal, paint = (kind.cpu() for kind in _told_kinds(state))
-    shown.copy_(base_colors.told(found, metal) * metal[:, None])  # paint keeps to its own
-    state.part(Metals).hue = base_colors.told_hue(found, paint).to(state.device)
+    told, painted = (kind.cpu() for kind in _told_kinds(state))  # hints' kinds, too
+    shown.copy_(base_colors.told(found, told) * told[:, None])  # paint keeps to its own
+    state.part(Metals).hue = base_colors.told_hue(found, painted).to(state.device)
     colored = state.from_hull and bool(shown.any())
-    state.told_light = base_colors.told_light(found, metal).to(state.device) if colored else None
+    state.told_light = base_colors.told_light(found, told).to(state.device) if colored else None
     if raised.any():
         material = torch.logit(base_colors.plausible(like_metals(found))).to(metallic.device)
         albedo[raised], roughness[raised] = material[raised, :3], material[raised, 3]
@@ -107,12 +106,12 @@ def _judge(state: State, first: bool = False) -> None:
         fresh = likely > 0.5
         roughness.copy_(roughness.minimum(torch.where(fresh, SHARP.metal, SHARP.paint).logit()))
         state.learned.forget("roughness", fresh)
-        fresh = _told_kinds(state)[0] & (shown[:, 3] > 0)
+        fresh = told.to(shown.device) & (shown[:, 3] > 0)
         albedo[fresh] = torch.logit(shown[fresh, :3])
         state.learned.forget("albedo", fresh)
-    for name in names:
+    for name in ("albedo", "roughness"):
         state.learned.forget(name, raised | lowered)
-    state.learned.forget("metallic", state.learned["told"])
+    state.learned.forget("metallic", metal | paint)
     now = state.surfels()
     whole = max(float(found.pixels.sum()), 1e-6)
     kinds = now.metallic > 0.5, raised, lowered
