@@ -118,7 +118,6 @@ def photograph(still: Still, turns: np.ndarray, heights: np.ndarray, out: Path, 
     for part, added in zip(still.object + still.around, objects + around, strict=True):
         added.location, added.rotation_euler = part.at, (0, 0, part.turn)
     scene.render.film_transparent = False
-    scene.cycles.max_bounces = 4
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as scratch:
         folder, light = Path(scratch, out.name), Path(scratch, "light.exr")

@@ -330,6 +330,39 @@ def test_highlights_are_stretched_across_the_brushing(tmp_path):
     assert brushed_height > 1.1 * height and brushed_width < 0.9 * width
 
 
+GOBLET = """
+import os, sys
+from pathlib import Path
+import numpy as np
+from scipy.spatial.transform import Rotation
+from refgs.formats.exr import write_exr
+from scripts.demo.cycles import Renderer
+from scripts.demo.shapes import Material, lathe
+folder = Path(sys.argv[1])
+write_exr(folder / "white.exr", np.ones((32, 64, 3), np.float32))
+outside, inside = [(0.0, -1.0), (0.4, -1.0), (0.5, 1.0)], [(0.47, 1.0), (0.37, -0.9), (0.0, -0.9)]
+goblet = lathe([(0, outside), (0, inside)], rows=80, columns=90)
+renderer = Renderer(goblet, (Material((1.0, 1.0, 1.0), 1.0, 0.1),), 48, 64)
+renderer.set_light(folder / "white.exr")
+pose = np.eye(4)
+pose[:3, :3] = Rotation.from_euler("x", 35, degrees=True).as_matrix()
+pose[:3, 3] = 4 * pose[:3, 2]
+write_exr(folder / "seen.exr", renderer.render(pose, seed=0)["color"])
+os._exit(0)  # Blender sometimes hangs when it cleans up
+"""
+
+
+def test_light_leaves_a_mirrored_goblet(tmp_path):
+    """Check a goblet that absorbs nothing, in a white world: it is white, inside too, where light comes out after many reflections."""
+    pytest.importorskip("bpy")
+    subprocess.run([sys.executable, "-c", GOBLET, tmp_path], cwd=ROOT, capture_output=True, check=True)
+    seen = OpenEXR.File(str(tmp_path / "seen.exr"), separate_channels=True).channels()
+    whole = seen["A"].pixels > 0.999
+    assert whole.sum() > 300
+    assert seen["G"].pixels[whole].min() > 0.9
+    assert seen["G"].pixels[whole].mean() == pytest.approx(1, abs=0.03)
+
+
 def test_every_scene_is_listed():
     folders = (ROOT / "benchmarks/scenes", ROOT / "scripts/demo")
     files = [path for folder in folders for path in folder.glob("*.py")]
