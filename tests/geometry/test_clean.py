@@ -4,7 +4,7 @@ import trimesh
 
 from refgs.errors import InputError
 from refgs.formats.mesh import Mesh
-from refgs.geometry.mesh import clean, is_crumbs, parts, smooth_normals
+from refgs.geometry.mesh import clean, denoised_normals, is_crumbs, parts, smooth_normals
 
 
 def as_mesh(*parts):
@@ -134,3 +134,47 @@ def test_no_edge_has_three_faces():
         mesh = clean(thin, 300)
         edges = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).edges_sorted
         assert np.unique(edges, axis=0, return_counts=True)[1].max() == 2
+
+
+def wavy(mesh: trimesh.Trimesh, seed: int):
+    """Displace a mesh along its normals by waves six edges long, and by noise. Returns the vertices."""
+    generator, edge = np.random.default_rng(seed), mesh.edges_unique_length.mean()
+    along = generator.normal(size=(3, 8))
+    heights = np.sin(mesh.vertices @ (2 * np.pi / (6 * edge) * along / np.linalg.norm(along, axis=0))).sum(axis=1)
+    heights = edge * (0.06 * heights + 0.1 * generator.normal(size=len(heights)))
+    return mesh.vertices + heights[:, None] * mesh.vertex_normals
+
+
+def degrees(a, b):
+    return np.degrees(np.arccos(np.clip((a * b).sum(axis=1), -1, 1)))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_denoised_normals_are_smooth_on_a_ball(seed):
+    mesh = ball(level=6)
+    vertices = wavy(mesh, seed)
+    before, after = (degrees(f(vertices, mesh.faces), mesh.vertices) for f in (smooth_normals, denoised_normals))
+    assert before.mean() > 5
+    assert after.mean() < 0.3 * before.mean()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_denoised_normals_keep_the_edges_of_a_box(seed):
+    """Check that the sides of a wavy box become flat, up to two triangles from their edges."""
+    mesh = trimesh.creation.box((2, 2, 2))
+    for _ in range(6):
+        mesh = mesh.subdivide()
+    vertices, size = wavy(mesh, seed), np.abs(mesh.vertices)
+    true = np.sign(mesh.vertices) * (np.arange(3) == size.argmax(axis=1)[:, None])
+    from_edge = (1 - np.sort(size, axis=1)[:, 1]) * 32  # in triangles
+    before, after = (degrees(f(vertices, mesh.faces), true) for f in (smooth_normals, denoised_normals))
+    for where, most in ((from_edge > 1.5, 0.6), ((from_edge > 1.5) & (from_edge < 5.5), 0.6)):
+        assert before[where].mean() > 5
+        assert after[where].mean() < most * before[where].mean()
+
+
+def test_denoised_normals_of_flat_and_tiny_meshes_are_as_they_were():
+    box = trimesh.creation.box((2, 2, 2))
+    assert denoised_normals(box.vertices, box.faces) == pytest.approx(smooth_normals(box.vertices, box.faces), abs=1e-6)
+    one = np.eye(3)
+    assert denoised_normals(one, np.array([[0, 1, 2]])) == pytest.approx(np.full((3, 3), 3**-0.5), abs=1e-6)

@@ -3,12 +3,17 @@
 import fast_simplification
 import numpy as np
 import trimesh
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 
 from refgs.errors import InputError
 from refgs.formats.mesh import Mesh, SmoothMesh
 
 KEEP = 0.01  # of the largest part's area: smaller parts are crumbs. the largest crumb of four real captures has 0.006
 HOLE = 32  # edges around a small hole, about seven voxels across
+NEAR = 0.03  # of the object's radius, within which normals are averaged
+MOST_NEAR = 64  # vertices within this distance
+ALIKE = 25.0  # degrees between normals: one standard deviation, beyond which they belong to another side of a crease
+ROUNDS = 3
 FRAY = 2  # rings of faces, from a border inwards: what is nowhere farther from the border frays out
 
 
@@ -152,3 +157,31 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     normals = np.stack([np.bincount(faces.ravel(), weighted[:, a], len(vertices)) for a in range(3)], axis=1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.where(length > 1e-12, normals / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+
+
+def denoised_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Compute normals (V, 3) of a noisy mesh by a bilateral filter (Zheng et al. 2011), which smooths surfaces but not creases.
+
+    A normal becomes the mean over vertices in a distance of NEAR times the object's radius, or over the MOST_NEAR nearest ones. They are
+    weighted by their area, by how near they are, and by how alike their normals are.
+    """
+    normals, areas = smooth_normals(vertices, faces).astype(np.float32), _vertex_areas(vertices, faces)
+    reach = NEAR * np.linalg.norm(np.ptp(vertices, axis=0)) / 2
+    count = int(np.clip(np.pi * reach**2 / max(areas.mean(), 1e-30), 1, min(MOST_NEAR, len(vertices))))
+    distance, near = cKDTree(vertices).query(vertices, k=np.arange(1, count + 1))
+    weight = np.exp(-2 * (distance / max(np.median(distance[:, -1]), 1e-30)) ** 2) * areas[near]
+    weight = weight.astype(np.float32)
+    for _ in range(ROUNDS):
+        around = normals[near]
+        alike = np.exp((np.einsum("vka,va->vk", around, normals) - 1) / np.radians(ALIKE) ** 2)
+        mean = np.einsum("vk,vka->va", weight * alike, around)
+        length = np.linalg.norm(mean, axis=1, keepdims=True)
+        normals = np.where(length > 1e-12, mean / np.maximum(length, 1e-12), normals)
+    return normals.astype(np.float64)
+
+
+def _vertex_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Compute a third of the area of the faces at each vertex (V,)."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    return np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
