@@ -18,6 +18,7 @@ SHELL = -1.7, 0.3  # voxels from the hull's surface, within which a known surfac
 AWAY = 0.1  # cosine below which a camera does not see the hull's surface
 ENOUGH = 0.05  # error of held-out photos, in sRGB codes, below which the hull explains them well enough
 BETTER = 0.9  # of the hull's error: a carved shape must have less
+AGAIN = 0.998  # of a carved shape's error: less is worth the seconds of another fog
 APART = 1.5  # voxels: where two shapes differ by less, neither is preferred
 SPREAD = 5.0  # voxels over which evidence is averaged
 
@@ -30,7 +31,8 @@ def carve_hollows(
     The hull is where `alpha` (X, Y, Z) is above one half. Voxels have the size `voxel` (3,), and the first has its corner at `low` (3,), in
     world units. A fog is learned in the hull (see `fog.open_hull`). The hull is carved as the fog tells where this explains held-out photos
     better (see `explain`), if the result explains them much better. Otherwise nothing is carved, because a fog also opens mirrors: what
-    they mirror seems to lie behind them. Nothing is carved either if there are few photos, or if the hull explains them well.
+    they mirror seems to lie behind them. Nothing is carved either if there are few photos, or if the hull explains them well. After the
+    first fog, up to two more are learned in what is left: each opens a deep hollow a little further.
 
     The light must not move relative to the object. If it does, as on a turntable, highlights look like a surface on the turntable's axis.
     """
@@ -69,16 +71,22 @@ def known(hull: Field, photos: Sequence[Photo]) -> np.ndarray:
 
 
 def choose(hull: Field, photos: Sequence[Photo], seed: int) -> Field:
-    """Return the hull, or the hull carved as a fog tells, if this explains held-out photos much better."""
+    """Return the hull, or the hull carved as fogs tell, each in what the last one left, as long as held-out photos are explained better."""
     rays = Rays.of(photos, hull)
-    first = Explained(hull, rays, seed)
-    if first.mean < ENOUGH:
+    shape, error = hull, Explained(hull, rays, seed)
+    if error.mean < ENOUGH:
         return hull
-    fog = open_hull(hull, known(hull, photos), rays, seed)
-    if not (fog.values < 0).any():
-        return hull
-    mixed = mix(hull, fog, first, Explained(fog, rays, seed))
-    return mixed if Explained(mixed, rays, seed).mean < BETTER * first.mean else hull
+    surface = known(hull, photos)
+    for better in (BETTER, AGAIN, AGAIN):
+        fog = open_hull(shape, surface, rays, seed)
+        if not (fog.values < 0).any():
+            break
+        mixed = mix(shape, fog, error, Explained(fog, rays, seed))
+        left = Explained(mixed, rays, seed)
+        if left.mean >= better * error.mean:
+            break
+        shape, error = mixed, left
+    return shape
 
 
 def mix(hull: Field, fog: Field, first: Explained, second: Explained) -> Field:

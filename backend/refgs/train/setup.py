@@ -37,7 +37,7 @@ from refgs.train.state import State, why_not_traced
 from refgs.train.timeline import Step
 
 # Time for carving the visual hull's hollows, and for finding normals by outlines, in times of the hull without hollows.
-HOLLOWS, OUTLINES = 30, 2
+HOLLOWS, OUTLINES = 50, 2
 
 PARTS: tuple[type[Part], ...] = (
     Metals, ChangingLight, Densification, Poses, Exposures, MirroredLight, TracedMesh, Coarse, Outlines, MeshNormals, Priors, Means,
