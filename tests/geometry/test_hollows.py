@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from refgs.geometry import explain, field, fog
+from refgs.geometry import explain, field, fog, hollows
 from refgs.geometry.hollows import carve_hollows
 from tests.makers.distances import around, box, sphere
 from tests.makers.textured import bowl, carve_coarsely, grid, half_ball, photograph
@@ -69,3 +69,31 @@ def test_the_same_seed_carves_the_same(monkeypatch):
         monkeypatch.setattr(module, "ITERATIONS", 20)
     photos = [photograph(camera, bowl) for camera in VIEWS]
     np.testing.assert_array_equal(carved_by(photos, half_ball), carved_by(photos, half_ball))
+
+
+@pytest.mark.parametrize(
+    ("errors", "carved_times"),
+    [
+        ([0.2, 0.17, 0.169, 0.168], 3),  # each fog opens a little more
+        ([0.2, 0.17, 0.1699], 1),  # a second fog is not worth its seconds
+        ([0.2, 0.17, 0.165, 0.17], 2),
+        ([0.2, 0.19], 0),  # the first must explain photos much better
+        ([0.04], 0),
+    ],
+)
+def test_fogs_follow_while_photos_are_explained_better(monkeypatch, errors, carved_times):
+    """Check how often a hull is carved if carved shapes have these errors. A shape is the number of times that it was carved."""
+
+    class Shape(int):
+        values = np.array([-1.0])
+
+    class Explained:
+        def __init__(self, shape, rays, seed):
+            self.mean = errors[shape] if shape < len(errors) else 0.0  # no error is asked for beyond the last
+
+    monkeypatch.setattr(hollows, "Explained", Explained)
+    monkeypatch.setattr(hollows, "known", lambda hull, photos: None)
+    monkeypatch.setattr(hollows, "open_hull", lambda shape, known, rays, seed: Shape(0))
+    monkeypatch.setattr(hollows, "mix", lambda shape, fog, first, second: Shape(shape + 1))
+    monkeypatch.setattr(hollows.Rays, "of", lambda photos, hull: None)
+    assert hollows.choose(Shape(0), [], 0) == carved_times

@@ -73,19 +73,19 @@ def known(hull: Field, photos: Sequence[Photo]) -> np.ndarray:
 def choose(hull: Field, photos: Sequence[Photo], seed: int) -> Field:
     """Return the hull, or the hull carved as fogs tell, each in what the last one left, as long as held-out photos are explained better."""
     rays = Rays.of(photos, hull)
-    shape, error = hull, Explained(hull, rays, seed)
-    if error.mean < ENOUGH:
+    shape, explained = hull, Explained(hull, rays, seed)
+    if explained.mean < ENOUGH:
         return hull
     surface = known(hull, photos)
     for better in (BETTER, AGAIN, AGAIN):
         fog = open_hull(shape, surface, rays, seed)
         if not (fog.values < 0).any():
             break
-        mixed = mix(shape, fog, error, Explained(fog, rays, seed))
-        left = Explained(mixed, rays, seed)
-        if left.mean >= better * error.mean:
+        mixed = mix(shape, fog, explained, Explained(fog, rays, seed))
+        carved = Explained(mixed, rays, seed)
+        if carved.mean >= better * explained.mean:
             break
-        shape, error = mixed, left
+        shape, explained = mixed, carved
     return shape
 
 
