@@ -38,7 +38,7 @@ def main() -> None:
     from refgs_addon.scene.render_eevee import render_preview
     from refgs_addon.scene.run_parts import show
     from refgs_addon.scene.world_light import relight
-    from scripts.demo.cycles import BOUNCES
+    from scripts.demo.cycles import let_light_leave
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
@@ -46,7 +46,7 @@ def main() -> None:
         False  # there are no lamps, and software Eevee spends most of a frame on preparing for them
     )
     scene.cycles.samples = 64  # as many as Eevee's
-    scene.cycles.max_bounces = scene.cycles.glossy_bounces = scene.cycles.diffuse_bounces = BOUNCES
+    let_light_leave(scene)
     run = import_run(options.run, scene)
     times = {drawn: [] for drawn in DRAWN}
     for hdri in (None, *options.hdri):

@@ -11,7 +11,6 @@ from mathutils import Matrix
 from scripts.demo.shapes import Material, Mesh
 
 FIELD_OF_VIEW = np.radians(40.0)
-BOUNCES = 64
 # Passes that are rendered with the picture, by the same camera rays. Each is the mean over the covered part of a pixel.
 VECTORS, SCALARS = ("normal", "albedo"), ("roughness", "metallic", "depth")
 INPUTS = {
@@ -21,6 +20,12 @@ INPUTS = {
     "brushed": ("Anisotropic", None),
 }
 """A material's values: the Principled BSDF's input and the pass of each."""
+
+
+def let_light_leave(scene: bpy.types.Scene) -> None:
+    """Let Cycles follow light until it has left hollows. By its default of 4 reflections, the inside of a mirrored goblet is black."""
+    cycles = scene.cycles
+    cycles.max_bounces = cycles.glossy_bounces = cycles.diffuse_bounces = 64  # most paths end by themselves
 
 
 class Renderer:
@@ -61,8 +66,7 @@ class Renderer:
         cycles.pixel_filter_type = "BOX"
         cycles.sample_clamp_indirect = cycles.sample_clamp_direct = 0.0
         cycles.blur_glossy = 0.0
-        # By Cycles' default of 4, the inside of a mirrored goblet is black where light comes out after more. Paths end by themselves.
-        cycles.max_bounces = cycles.glossy_bounces = cycles.diffuse_bounces = BOUNCES
+        let_light_leave(scene)
         cycles.use_light_tree = False  # one panorama and no lamps
         cycles.use_denoising = True
         cycles.denoiser = "OPENIMAGEDENOISE"

@@ -13,7 +13,7 @@ HOLE = 32  # edges around a small hole, about seven voxels across
 NEAR = 0.03  # of the object's radius, within which normals are averaged
 MOST_NEAR = 64  # vertices within this distance
 ALIKE = 25.0  # degrees between normals: one standard deviation, beyond which they belong to another side of a crease
-ROUNDS = 3
+ROUNDS = 3  # of averaging
 FRAY = 2  # rings of faces, from a border inwards: what is nowhere farther from the border frays out
 
 
@@ -165,7 +165,9 @@ def denoised_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     A normal becomes the mean over vertices in a distance of NEAR times the object's radius, or over the MOST_NEAR nearest ones. They are
     weighted by their area, by how near they are, and by how alike their normals are.
     """
-    normals, areas = smooth_normals(vertices, faces).astype(np.float32), _vertex_areas(vertices, faces)
+    normals = smooth_normals(vertices, faces).astype(np.float32)
+    thirds = np.repeat(trimesh.triangles.area(vertices[faces]) / 3, 3)
+    areas = np.bincount(faces.ravel(), thirds, len(vertices))
     reach = NEAR * np.linalg.norm(np.ptp(vertices, axis=0)) / 2
     count = int(np.clip(np.pi * reach**2 / max(areas.mean(), 1e-30), 1, min(MOST_NEAR, len(vertices))))
     distance, near = cKDTree(vertices).query(vertices, k=np.arange(1, count + 1))
@@ -178,10 +180,3 @@ def denoised_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         length = np.linalg.norm(mean, axis=1, keepdims=True)
         normals = np.where(length > 1e-12, mean / np.maximum(length, 1e-12), normals)
     return normals.astype(np.float64)
-
-
-def _vertex_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Compute a third of the area of the faces at each vertex (V,)."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
-    return np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))

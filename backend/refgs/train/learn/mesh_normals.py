@@ -30,15 +30,14 @@ class MeshNormals(Part):
 
     def told(self, state: State, mesh: Occluder, view: int) -> ToldNormals:
         """Return the normals of a mesh in a view."""
-        if self.of is mesh and view in self.views:
-            return self.views[view]
         with state.clock.part("mesh"):
             if self.of is not mesh:
                 self.of, self.views = mesh, {}
                 vertices, faces = mesh.mesh.vertices, mesh.mesh.faces
                 self.surface = SmoothMesh(vertices, faces, denoised_normals(vertices, faces))
-            known = np.ones(len(self.surface.vertices), bool)
-            self.views[view] = ToldNormals.of(self.surface, mesh, known, state.photos[view].camera, state.device)
+            if view not in self.views:
+                known = np.ones(len(self.surface.vertices), bool)
+                self.views[view] = ToldNormals.of(self.surface, mesh, known, state.photos[view].camera, state.device)
         return self.views[view]
 
 
