@@ -15,7 +15,7 @@ from scripts.demo.shapes import Scene
 REFLECTIVE = ("ball", "car", "figure", "helmet", "jar", "plate", "rings", "teapot", "toaster")
 DULL = ("brushed", "embossed", "part", "tarnished")
 """Metals that look matte, or are a small part of something matte."""
-AMBIGUOUS = ("bowl", "brass", "dark", "gloss", "lamps", "night", "silver", "twins")
+AMBIGUOUS = ("bowl", "brass", "bricks", "dark", "gloss", "lamps", "night", "silver", "twins")
 """Photos of these can be explained twice: mirrors in the dark, silver among white, paint like metal, a hollow with content."""
 MATTE = ("matte",)
 STILLS = tuple(f"still-{number}" for number in range(20))
