@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from benchmarks.scenes.still import METALS
 from refgs.formats.splats import read_splats
 from refgs.model.surfels import activate, raw_metallic
 from refgs.train.keep.asset import write_asset
@@ -95,6 +96,15 @@ def test_what_no_photo_shows_is_not_told(made):
     assert bool((found.metal == 0.5).all()) and not found.seen.exact.any() and found.seen.pixels.any()
 
 
+def test_metals_have_few_colours():
+    """Check metals and paints, each bright and in the shade."""
+    paints = [(0.82, 0.47, 0.015), (0.55, 0.025, 0.015), (0.02, 0.14, 0.52), (0.1, 0.4, 0.1), (0.4, 0.22, 0.1)]
+    for shade in (1.0, 0.1):
+        assert bool((reckoning.from_metals(shade * torch.tensor(METALS)) < 0.002).all())
+        assert bool((reckoning.from_metals(shade * torch.tensor(paints)) == reckoning.FOREIGN).all())
+    assert float(reckoning.from_metals(torch.zeros(1, 3))) == 0.0
+
+
 @pytest.mark.parametrize(
     ("diffuse", "reflectance", "metal"), [(0.0, 0.9, True), (0.0, 0.5, True), (0.005, 0.04, False), (0.2, 0.04, False)]
 )
@@ -116,7 +126,9 @@ def test_a_metal_in_the_dark_is_told_by_what_it_mirrors_of_the_object(diffuse, r
     learned = torch.where(met[..., None], there, 0.2)
     near = neighbours(torch.rand(count, 3, generator=generator), NEIGHBOURS)
     fits = mirrored.fit_both(seen, (([each] * 3, which) for each, which in zip(learned, met, strict=True)), near)
-    values = reckoning.terms(seen, fits, near, *reckoning.mean_and_changes(seen, near))
+    values = reckoning.terms(
+        seen, fits, near, *reckoning.metal_reflectance(fits), *reckoning.mean_and_changes(seen, near)
+    )
     values["changing light"] = torch.zeros(count)
     assert bool((reckoning.log_odds(values) > 0).all()) == bool((reckoning.log_odds(values) > 0).any()) == metal
     assert bool((fits.of_object.ratio < 0).all()) == metal
@@ -147,7 +159,9 @@ def test_photos_that_clip_a_surface_tell_what_it_is(diffuse, reflectance, metal)
     def fit(clip):
         seen = Seen(shown.clamp_max(clip), shown > clip, weight, pixels, shown.mean(dim=1), up, up)
         fits = mirrored.fit_both(seen, (([each] * 3, which) for each, which in zip(light, met, strict=True)), near)
-        return fits.everywhere, reckoning.terms(seen, fits, near, *reckoning.mean_and_changes(seen, near))
+        return fits.everywhere, reckoning.terms(
+            seen, fits, near, *reckoning.metal_reflectance(fits), *reckoning.mean_and_changes(seen, near)
+        )
 
     (clipped, terms), (whole, all_terms) = fit(1.0), fit(math.inf)
     assert bool((clipped.ratio < 0).all()) == bool((clipped.ratio < 0).any()) == metal

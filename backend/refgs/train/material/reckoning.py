@@ -27,23 +27,30 @@ from refgs.train.material.observe import (
 from refgs.train.state import State, why_not_traced
 
 WEIGHTS = {
-    "fall": 6.16,
-    "light's fall": -1.85,
-    "ratio": 3.66,
-    "reflectance": 8.03,
-    "object's ratio": 2.46,
-    "object's reflectance": 3.02,
-    "tint": 2.10,
-    "grey": 2.35,
-    "changing light": -35.61,
+    "fall": 5.70,
+    "light's fall": -0.95,
+    "ratio": 2.86,
+    "reflectance": 5.56,
+    "object's ratio": 3.38,
+    "object's reflectance": 4.32,
+    "tint": 2.12,
+    "grey": 1.78,
+    "no metal's colour": -4.94,
+    "too dark for metal": -3.22,
+    "changing light": -28.44,
 }
-BIAS = -5.85
+BIAS = -3.99
 LOW = 0.1  # quantile over the photos
 DARKEST = 1e-4  # radiance: photos tell no darker ones apart
 MOST_FALL, MOST_RATIO = 2.5, 1.5  # terms that are larger tell no more
 ENOUGH_PIXELS = 30.0  # the neighbours' pixels in all photos from which on what they mirror of the object tells
 LEAST_SHOWN = 0.02  # least mean radiance of what a surfel mirrors of the object: in less, errors tell more
 CHANGES = 0.15  # relative change from which on its colour tells fully
+# Linear F0 of chromium, brass, gold and copper (https://physicallybased.info). Those of silver, aluminium, titanium, iron and
+# bronze lie between them.
+METALS = (0.654, 0.685, 0.701), (0.910, 0.778, 0.423), (1.059, 0.773, 0.307), (0.932, 0.623, 0.522)
+FOREIGN = 0.05  # distance of a chromaticity from those of metals; farther ones tell no more
+DULL = 0.6  # F0 of metals in the brightest channel: of those above, and of iron and titanium 0.53 and 0.44
 LIKE = 0.01  # weight of a metal's material if it is only fitted, relative to a learned one
 
 
@@ -94,14 +101,12 @@ def reckon(state: State) -> Reckoned:
     fits = mirrored.fit_both(seen, rays, near)
     graph = same_material.laplacian(surfels.positions, seen, near)
     shown, changes = mean_and_changes(seen, near)
-    values = terms(seen, fits, near, shown, changes)
-    values["changing light"] = torch.full_like(seen.pixels, changing_light.lead(state, near))
     every, of_object = fits.everywhere, fits.of_object
+    reflectance, by_object = metal_reflectance(fits)
+    values = terms(seen, fits, near, reflectance, by_object, shown, changes)
+    values["changing light"] = torch.full_like(seen.pixels, changing_light.lead(state, near))
     known = (seen.pixels > same_material.FRINGE) & (every.pixels > ENOUGH_PIXELS) & (every.exact > LEAST_PIXELS)
     metal = same_material.spread(graph, log_odds(values), known.float()).sigmoid()
-    by_object = (of_object.exact > ENOUGH_PIXELS) & (of_object.white.mean(dim=1) > LEAST_SHOWN * of_object.exact)
-    level = (of_object.reflected / of_object.white.clamp_min(1e-6)).clamp(0, 1)
-    reflectance = torch.where(by_object[:, None], level, every.reflectance)
     roughness = torch.where(by_object, of_object.roughness, every.roughness)
     pixels = seen.pixels * state.wanted().cpu()
     sums = of_object.reflected, of_object.white, fits.met
@@ -110,15 +115,32 @@ def reckon(state: State) -> Reckoned:
     )
 
 
+def metal_reflectance(fits: mirrored.Mirrored) -> tuple[Tensor, Tensor]:
+    """Return the reflectance (N, 3) of the metal that explains the photos best, and whether what it mirrors of the object tells it (N,)."""
+    every, of_object = fits.everywhere, fits.of_object
+    by_object = (of_object.exact > ENOUGH_PIXELS) & (of_object.white.mean(dim=1) > LEAST_SHOWN * of_object.exact)
+    level = (of_object.reflected / of_object.white.clamp_min(1e-6)).clamp(0, 1)
+    return torch.where(by_object[:, None], level, every.reflectance), by_object
+
+
 def log_odds(values: dict[str, Tensor]) -> Tensor:
     """Weigh the terms (N,) by their names, and return their sum (N,): the log-odds of metal against paint."""
     return BIAS + torch.stack([weight * values[name] for name, weight in WEIGHTS.items()]).sum(dim=0)
 
 
-def terms(seen: Seen, fits: mirrored.Mirrored, near: Tensor, shown: Tensor, changes: Tensor) -> dict[str, Tensor]:
+def terms(
+    seen: Seen,
+    fits: mirrored.Mirrored,
+    near: Tensor,
+    reflectance: Tensor,
+    by_object: Tensor,
+    shown: Tensor,
+    changes: Tensor,
+) -> dict[str, Tensor]:
     """Compute the terms (N,) that compare what each surfel shows with what it mirrors.
 
-    `near` (N, K) are neighbours to average over; `shown` and `changes` is what they show (`mean_and_changes`).
+    `near` (N, K) are neighbours to average over; `shown` and `changes` is what they show (`mean_and_changes`). `reflectance` (N, 3) is that
+    of the best metal, and `by_object` (N,) tells whether it does not depend on the light (`metal_reflectance`).
 
     - fall: how far the darkest tenth of the photos is below the median, as a logarithm. A metal has no diffuse radiance, so it may be far
       darker than its median. Clipped photos count: what is brighter than the median does not change it.
@@ -126,6 +148,8 @@ def terms(seen: Seen, fits: mirrored.Mirrored, near: Tensor, shown: Tensor, chan
     - ratio, reflectance: see `mirrored.Fit`, by the light and, as "object's …", by photos in which the surfel mirrors the object
     - tint: whether the radiance changes along the surface's own colour (1), as a coloured metal's, or along grey (0)
     - grey: 1 where the surface has no colour, so that its tint tells nothing
+    - no metal's colour: how far `reflectance` is from that of all metals, from 0 to 1 (`from_metals`)
+    - too dark for metal: how far it is below DULL, from 0 to 1, where it does not depend on the light
 
     One more, "changing light", is a number for the whole object (`changing_light.lead`).
     """
@@ -141,7 +165,23 @@ def terms(seen: Seen, fits: mirrored.Mirrored, near: Tensor, shown: Tensor, chan
         "object's reflectance": met * of_object.reflectance.amax(dim=1),
         "tint": tint,
         "grey": grey,
+        "no metal's colour": from_metals(reflectance) / FOREIGN,
+        "too dark for metal": by_object * (1 - reflectance.amax(dim=1) / DULL).clamp_min(0),
     }
+
+
+def from_metals(color: Tensor) -> Tensor:
+    """Return how far the chromaticities of linear colours (N, 3) are from those of metals: (N,), from 0 to FOREIGN.
+
+    All metals reflect colours between a bluish grey, yellow and orange. Red, green and blue things are paint, and so is bright yellow
+    plastic, which reflects less blue than gold.
+    """
+    across = torch.linalg.qr(torch.tensor([[1.0, 1.0, 1.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]]).T).Q[:, 1:]
+    point, corners = from_grey(color.clamp_min(0)) @ across, from_grey(torch.tensor(METALS)) @ across
+    sides = corners.roll(-1, dims=0) - corners
+    outward = torch.nn.functional.normalize(torch.stack([sides[:, 1], -sides[:, 0]], dim=1), dim=1)
+    outward = outward * torch.sign((outward * (corners - corners.mean(dim=0))).sum(dim=1, keepdim=True))
+    return ((point[:, None] - corners) * outward).sum(dim=2).amax(dim=1).clamp(0, FOREIGN)
 
 
 def _fall(radiance: Tensor, seen: Seen, near: Tensor) -> Tensor:
