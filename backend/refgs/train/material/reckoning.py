@@ -46,11 +46,11 @@ MOST_FALL, MOST_RATIO = 2.5, 1.5  # terms that are larger tell no more
 ENOUGH_PIXELS = 30.0  # the neighbours' pixels in all photos from which on what they mirror of the object tells
 LEAST_SHOWN = 0.02  # least mean radiance of what a surfel mirrors of the object: in less, errors tell more
 CHANGES = 0.15  # relative change from which on its colour tells fully
-# Linear F0 of chromium, brass, gold and copper (https://physicallybased.info). Those of silver, aluminium, titanium, iron and
-# bronze lie between them.
+# Linear F0 of chromium, brass, gold and copper (https://physicallybased.info): corners of a polygon of chromaticities, in which those of
+# silver, aluminium, titanium, iron and bronze lie.
 METALS = (0.654, 0.685, 0.701), (0.910, 0.778, 0.423), (1.059, 0.773, 0.307), (0.932, 0.623, 0.522)
-FOREIGN = 0.05  # distance of a chromaticity from those of metals; farther ones tell no more
-DULL = 0.6  # F0 of metals in the brightest channel: of those above, and of iron and titanium 0.53 and 0.44
+FOREIGN = 0.05  # distance of a chromaticity from those of metals; farther ones tell no more. A metal's is wrong by 0.02 where normals err
+DULL = 0.6  # F0 in the brightest channel from which on a metal is not dull: iron has 0.53, titanium 0.44, the other seven at least 0.7
 LIKE = 0.01  # weight of a metal's material if it is only fitted, relative to a learned one
 
 
@@ -176,11 +176,11 @@ def from_metals(color: Tensor) -> Tensor:
     All metals reflect colours between a bluish grey, yellow and orange. Red, green and blue things are paint, and so is bright yellow
     plastic, which reflects less blue than gold.
     """
-    across = torch.linalg.qr(torch.tensor([[1.0, 1.0, 1.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]]).T).Q[:, 1:]
-    point, corners = from_grey(color.clamp_min(0)) @ across, from_grey(torch.tensor(METALS)) @ across
-    sides = corners.roll(-1, dims=0) - corners
-    outward = torch.nn.functional.normalize(torch.stack([sides[:, 1], -sides[:, 0]], dim=1), dim=1)
-    outward = outward * torch.sign((outward * (corners - corners.mean(dim=0))).sum(dim=1, keepdim=True))
+    corners = from_grey(torch.tensor(METALS))
+    # Chromaticities lie in a plane across grey, in which this is normal to the polygon's sides.
+    outward = torch.linalg.cross(corners.roll(-1, dims=0) - corners, torch.ones_like(corners))
+    outward = -torch.nn.functional.normalize(outward, dim=1)
+    point = from_grey(color.clamp_min(0))
     return ((point[:, None] - corners) * outward).sum(dim=2).amax(dim=1).clamp(0, FOREIGN)
 
 
