@@ -59,7 +59,7 @@ class Mirrored(NamedTuple):
     """Hold the fits to all photos, and to those in which the mirror ray meets the object.
 
     `radiance` (N, V) is what each surfel mirrors in each photo: the mean of the channels, at the roughness MIDDLE. `met` (N, V) tells
-    whether that is the object.
+    whether that is the object. Where a photo does not show a surfel, both are 0.
     """
 
     everywhere: Fit
@@ -89,20 +89,23 @@ def observe_both(
 def _mirrored(
     surfels: Surfels, seen: Seen, occluder: Occluder | None, light: Environment, turns: list[Tensor]
 ) -> Iterator[tuple[list[Tensor], Tensor]]:
-    """Yield, for each photo, the linear radiance that the surfels mirror towards its camera: a tensor (N, 3) for each of ROUGHNESSES.
+    """Yield, for each photo, the linear radiance that the M surfels in it mirror towards its camera: (M, 3) for each of ROUGHNESSES.
 
-    Also yields the mask (N,) of surfels whose mirror ray meets the object.
+    Also yields the mask (M,) of surfels whose mirror ray meets the object.
 
     `turns` has a rotation matrix (3, 3) for each photo. It turns directions in the run's frame into those in which `light` is sampled.
     """
-    levels, points = cubemap.in_texel_order(light.levels, light.sides), surfels.positions.double().numpy()
+    levels = cubemap.in_texel_order(light.levels, light.sides)
     there = torch.zeros(0, 3) if occluder is None else _at_vertices(surfels, seen, occluder.mesh)
-    for turn, normal, towards in zip(turns, seen.normal.unbind(dim=1), seen.towards.unbind(dim=1), strict=True):
-        direction = mirror(-towards, normal)
-        levels_of = (torch.full((len(points),), float(prefilter.level_of(roughness))) for roughness in ROUGHNESSES)
+    for view, turn in enumerate(turns):
+        rows = seen.in_photo(view)
+        normal = seen.normal[rows, view]
+        direction = mirror(-seen.towards[rows, view], normal)
+        levels_of = (torch.full((len(rows),), float(prefilter.level_of(roughness))) for roughness in ROUGHNESSES)
         shown = [cubemap.sample(levels, light.sides, direction @ turn.T, level) for level in levels_of]
-        of_object = torch.zeros(len(points), dtype=torch.bool)
+        of_object = torch.zeros(len(rows), dtype=torch.bool)
         if occluder is not None:
+            points = surfels.positions[rows].double().numpy()
             face, inside = occluder.meet(points, normal.double().numpy(), direction.double().numpy())
             met = face >= 0
             of_object = torch.from_numpy(met)
@@ -120,11 +123,13 @@ def _at_vertices(surfels: Surfels, seen: Seen, mesh: Mesh) -> Tensor:
 
 
 class _Photo(NamedTuple):
-    """Hold what a fit needs of one photo: `weight` (N,), linear radiance `shown`, and whether it is `clipped` (N, 3).
+    """Hold what a fit needs of one photo, of the surfels `rows` (M,) alone that it shows.
 
-    `mirrored` (N, 3) is what is mirrored at each of the first of ROUGHNESSES. `tables` (N, 4, 1) are `brdf.reflectance_table` there.
+    `weight` (M,) is that of `Seen`, `shown` (M, 3) the linear radiance, `clipped` (M, 3) where the photo is clipped. `mirrored` (M, 3) is
+    what is mirrored at each of the first of ROUGHNESSES. `tables` (M, 4, 1) are `brdf.reflectance_table` there.
     """
 
+    rows: Tensor
     weight: Tensor
     shown: Tensor
     clipped: Tensor
@@ -133,16 +138,21 @@ class _Photo(NamedTuple):
 
     @classmethod
     def of(cls, seen: Seen, view: int, mirrored: list[Tensor]) -> "_Photo":
-        cosine = (seen.normal[:, view] * seen.towards[:, view]).sum(dim=1).clamp(GRAZING, 1)
+        rows = seen.in_photo(view)
+        weight, shown, clipped, normal, towards = (
+            each[rows, view] for each in (seen.weight, seen.radiance, seen.clipped, seen.normal, seen.towards)
+        )
+        cosine = (normal * towards).sum(dim=1).clamp(GRAZING, 1)
         tables = [look_up(cosine, torch.full_like(cosine, roughness))[..., None] for roughness in ROUGHNESSES]
-        return cls(seen.weight[:, view], seen.radiance[:, view], seen.clipped[:, view], mirrored, tables)
+        return cls(rows, weight, shown, clipped, mirrored, tables)
 
     def part(self, which: Tensor, kinds: int) -> "_Photo":
-        """Return what the surfels `which` (N,) show, and what is mirrored at the first `kinds` roughnesses."""
-        return self._replace(weight=self.weight * which, mirrored=self.mirrored[:kinds], tables=self.tables[:kinds])
+        """Return what those that the mask `which` (M,) selects show, and what is mirrored at the first `kinds` roughnesses."""
+        rows, weight, shown, clipped = (each[which] for each in self[:4])
+        return _Photo(rows, weight, shown, clipped, *([each[which] for each in many[:kinds]] for many in self[4:]))
 
     def models(self) -> tuple[Tensor, Tensor]:
-        """Return linear models, (H, N, 3) each: a model shows the first + value · the second, with one unknown value a channel.
+        """Return linear models, (H, M, 3) each: a model shows the first + value · the second, with one unknown value a channel.
 
         Let R be what a surfel mirrors. A metal of reflectance s shows (s FG0 + FG1) R. Paint of diffuse radiance c shows c + F R. FG0, FG1
         and F are the channels 0, 1 and 3 of the table. The models are a metal for each roughness, paint for each roughness, and paint that
@@ -156,15 +166,15 @@ class _Photo(NamedTuple):
         return torch.stack(offset), torch.stack(slope)
 
 
-def _solve(photos: list[_Photo], kinds: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Fit each model to the photos by least squares. Return values and power (H, N, 3), and errors (H, N).
+def _solve(photos: list[_Photo], count: int, kinds: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Fit each model to the photos by least squares. Return values and power (H, N, 3), and errors (H, N). N is `count`.
 
     Where a photo is clipped, a model may be brighter: its error is one-sided. Were such photos left out, only the dark ones of a shiny
     metal would be left, and they look like paint. Errors are piecewise quadratic in the values, so Newton's method solves for these.
     """
     # Reflectance is at most 1, and the diffuse radiance of paint has no limit.
     most = torch.tensor([1.0] * kinds + [torch.inf] * (kinds + 1)).view(-1, 1, 1)
-    value, shape = None, (len(most), *photos[0].shown.shape)
+    value, shape = None, (len(most), count, 3)
     power, both, rest = (torch.zeros(shape) for _ in range(3))
     for _ in range(NEWTON_STEPS):
         for each in power, both, rest:
@@ -172,11 +182,11 @@ def _solve(photos: list[_Photo], kinds: int) -> tuple[Tensor, Tensor, Tensor]:
         for photo in photos:
             offset, slope = photo.models()
             over = photo.shown - offset
-            free = photo.clipped if value is None else photo.clipped & (value * slope > over)
+            free = photo.clipped if value is None else photo.clipped & (value[:, photo.rows] * slope > over)
             counts = photo.weight[:, None] * ~free
-            power += counts * slope.square()
-            both += counts * slope * over
-            rest += counts * over.square()
+            power.index_add_(1, photo.rows, counts * slope.square())
+            both.index_add_(1, photo.rows, counts * slope * over)
+            rest.index_add_(1, photo.rows, counts * over.square())
         solved = (both / power.clamp_min(1e-12)).clamp_min(0).minimum(most)
         value = solved if value is None else torch.where(power > 0, solved, value)
     assert value is not None
@@ -189,19 +199,22 @@ def _fit(photos: list[_Photo], kinds: int, near: Tensor, by_power: bool) -> Fit:
     With `by_power`, a surfel counts for the mean reflectance by the square of what it mirrors. That is best where the mirrored radiance
     is known, as that of the object. A lamp's is not, because photos clip it.
     """
-    value, power, errors = _solve(photos, kinds)
-    square = torch.stack([(photo.weight[:, None] * photo.shown.square()).sum(dim=1) for photo in photos]).sum(dim=0)
-    errors = pooled(torch.cat([errors, TOLERANCE**2 * square[None]]).clamp_min(0).T, near)
+    value, power, errors = _solve(photos, len(near), kinds)
+    square = torch.zeros(len(near), 3)
+    for photo in photos:
+        square.index_add_(0, photo.rows, photo.weight[:, None] * photo.shown.square())
+    errors = pooled(torch.cat([errors, TOLERANCE**2 * square.sum(dim=1)[None]]).clamp_min(0).T, near)
     metal, paint, least = errors.split([kinds, kinds + 1, 1], dim=1)
     ratio = (metal.amin(dim=1) + least[:, 0]) / (paint.amin(dim=1) + least[:, 0]).clamp_min(1e-12)
     best = metal.argmin(dim=1)
-    rows = best, torch.arange(len(best))
     # Sums of the shown, of what white would show, and of weights, where no channel is clipped, and of all weights.
     whole = torch.zeros(len(best), 8)
     for photo in photos:
         (offset, slope), exact = photo.models(), ~photo.clipped.any(dim=1, keepdim=True)
-        columns = exact * (photo.shown - offset[rows]), exact * slope[rows], exact, torch.ones_like(exact)
-        whole += photo.weight[:, None] * torch.cat(columns, dim=1)
+        model = best[photo.rows], torch.arange(len(photo.rows))
+        columns = exact * (photo.shown - offset[model]), exact * slope[model], exact, torch.ones_like(exact)
+        whole.index_add_(0, photo.rows, photo.weight[:, None] * torch.cat(columns, dim=1))
+    rows = best, torch.arange(len(best))
     weight = power[rows] if by_power else whole[:, 7:].expand(-1, 3)
     summed = pooled(torch.cat([value[rows] * weight, weight, whole], dim=1), near)
     chosen, weight, shown, white, exact, pixels = summed.split([3, 3, 3, 3, 1, 1], dim=1)
@@ -215,13 +228,12 @@ def fit_both(seen: Seen, mirrored: Iterable[tuple[list[Tensor], Tensor]], near: 
 
     `mirrored` are the yields of `_mirrored`. `near` (N, K) are the neighbours to average over.
     """
-    photos, radiance, all_met = [], [], []
+    photos, of_object = [], []
+    radiance, all_met = torch.zeros_like(seen.weight), torch.zeros_like(seen.weight, dtype=torch.bool)
     for view, (lights, met) in enumerate(mirrored):
-        photos.append(_Photo.of(seen, view, lights))
-        radiance.append(lights[MIDDLE].mean(dim=1))
-        all_met.append(met)
-    kinds = len(ROUGHNESSES)
-    # The radiance of the object is not blurred, so that one roughness is enough there.
-    of_object = [photo.part(met, 1) for photo, met in zip(photos, all_met, strict=True)]
-    views = (torch.stack(each, dim=1) for each in (radiance, all_met))
-    return Mirrored(_fit(photos, kinds, near, False), _fit(of_object, 1, near, True), *views)
+        photo = _Photo.of(seen, view, lights)
+        photos.append(photo)
+        # The radiance of the object is not blurred, so that one roughness is enough there.
+        of_object.append(photo.part(met, 1))
+        radiance[photo.rows, view], all_met[photo.rows, view] = lights[MIDDLE].mean(dim=1), met
+    return Mirrored(_fit(photos, len(ROUGHNESSES), near, False), _fit(of_object, 1, near, True), radiance, all_met)

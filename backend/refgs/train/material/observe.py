@@ -80,6 +80,10 @@ class Seen(NamedTuple):
     normal: Tensor
     towards: Tensor
 
+    def in_photo(self, view: int) -> Tensor:
+        """Return the indices (M,) of the surfels that a photo shows: about a quarter of all."""
+        return self.weight[:, view].nonzero()[:, 0]
+
     @property
     def exact(self) -> Tensor:
         """Return `weight` (N, V), but 0 where any channel is clipped."""

@@ -62,7 +62,7 @@ class Reckoned(NamedTuple):
     - `reflectance` (N, 3), `roughness` (N,): values of the metal that explains the photos best
     - `by_object` (N,): whether the reflectance follows from what photos show of the object, so that it does not depend on the light
     - `reflected`, `white` (N, 3): see `mirrored.Fit`, by the photos in which surfels mirror the object
-    - `met` (N, V): whether a surfel mirrors the object in a photo
+    - `met` (N, V): whether a surfel mirrors the object in a photo that shows it
     - `changes` (N, 3, 3): the covariance of the radiance of a surfel and its neighbours over the photos, relative to its mean
     - `graph`: the Laplacian of neighbouring surfels (`same_material.laplacian`)
     - `terms`: see WEIGHTS, (N,) each, before they are spread
