@@ -15,8 +15,8 @@ than few lamps, a thousand dark texels became a little brighter. Six steps preve
 - Lamps have the colour that highlights of paint tell (`told_hue`). Together with paint they have the brightness that highlights
   (`highlights.py`) and experience tell (`wanted`).
 
-All but the first are only done where photos tell the base colour of a metal: elsewhere the light is not known. Metals are drawn and paint
-is averaged until 60 % of the training. Later, only their shades and means are kept: photos add patterns and stains.
+The last three are only done where metals mirror a third of the light: elsewhere it is not known. Metals are drawn and paint is averaged
+until 60 % of the training. Later, only their shades and means are kept: photos add patterns and stains.
 """
 
 import math
@@ -52,6 +52,9 @@ PAINT = 0.34  # all paint's brightest channel in the mean, as far as highlights 
 PAINTS = 0.66  # standard deviation of its natural logarithm in 21 rendered scenes
 HUES = 0.13  # standard deviation of the logarithms of a light's hue: Blender's eight HDRIs have this
 PARTS_HUES = 0.1  # the same of what highlights show of a light, around the hue of all of it: 18 rendered scenes
+LEAST_TOLD = (
+    1 / 3
+)  # fraction of the light's texels that metals must mirror, so that it is known: a flat mirror tells 0.4, seen from above
 LEAST_MIRRORED = 2.0  # pixels that must mirror a texel of the coarse cubemap, so that they tell its radiance
 STEP, MOST_STEP = 0.3, 0.1  # part of the way to balance, each time, and the largest step: logarithms
 TOWARDS = 0.4  # part of the way to what highlights tell, each time that they are compared
@@ -110,14 +113,18 @@ def told(found: Reckoned, metals: Tensor) -> Tensor:
     return torch.cat([plausible(reflected / white), known.clamp(0, 1)[:, None]], dim=1) * (known > LEAST_KNOWN)[:, None]
 
 
-def told_light(found: Reckoned, metals: Tensor) -> Tensor:
-    """Tell which texels (6·SIDE²,) of the light photos show in `metals` (N,)."""
+def told_light(found: Reckoned, metals: Tensor) -> Tensor | None:
+    """Tell which texels (6·SIDE²,) of the light photos show in `metals` (N,). Return None if these are less than LEAST_TOLD.
+
+    A handful of metals must not set the scale of a light that they hardly mirror: all paint would follow it.
+    """
     seen, pixels = found.seen, torch.zeros(6 * SIDE**2)
     for view, weight in enumerate(seen.exact.T):
         shows = metals & (weight > 0) & ~found.met[:, view]
         directions = mirror(-seen.towards[shows, view], seen.normal[shows, view])
         pixels.index_add_(0, cubemap.texels_at(directions, SIDE), weight[shows])
-    return pixels > LEAST_MIRRORED
+    known = pixels > LEAST_MIRRORED
+    return known if float(known.float().mean()) >= LEAST_TOLD else None
 
 
 def told_hue(found: Reckoned, paint: Tensor) -> Tensor:
@@ -156,16 +163,12 @@ def draw(state: State, metals: Tensor) -> None:
 
 
 @torch.no_grad()
-def level(state: State, metals: Tensor, paint: Tensor, hue: Tensor, mean: Tensor | None) -> None:
-    """Keep the mean base colour of `metals` (N,) at what photos tell, and balance lamps with `paint` (N,) (see `_balance`).
-
-    Differences between base colours can learn.
-    """
+def level(state: State, metals: Tensor) -> None:
+    """Keep the mean base colour of `metals` (N,) at what photos tell. Differences between base colours can learn."""
     raw = state.learned["albedo"]
     logs, wrong, weight = _wrong(state, metals)
     off = (weight * wrong).sum(dim=0) / weight.sum().clamp_min(1e-6)
-    logs = logs + torch.where(weight > 0, off, 0) + paint[:, None] * _balance(state, paint, hue, mean)
-    raw.copy_(torch.where((weight > 0) | paint[:, None], torch.logit(plausible(logs.exp())), raw))
+    raw.copy_(torch.where(weight > 0, torch.logit(plausible((logs + off).exp())), raw))
 
 
 def _wrong(state: State, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -236,7 +239,7 @@ def _area(surfels: Surfels, which: Tensor) -> Tensor:
 
 @torch.no_grad()
 def wanted(state: State, paint: Tensor, told: Told | None, before: Tensor | None) -> Tensor:
-    """Return the mean to which the brightest channel of `paint` (N,) is drawn (see `_balance`): a natural logarithm.
+    """Return the mean to which the brightest channel of `paint` (N,) is drawn (see `balance`): a natural logarithm.
 
     Lamps should be brighter, and so paint darker, if highlights of paint are too dark (`told`, see `highlights.compare`), or if paint is
     brighter than it usually is. Each counts by its variance. `before` is what was returned before. It is changed until highlights agree,
@@ -260,11 +263,12 @@ def _mean(state: State, paint: Tensor) -> Tensor:
     return mean.clamp_min(DARKEST).log()
 
 
-def _balance(state: State, paint: Tensor, hue: Tensor, mean: Tensor | None) -> Tensor:
-    """Change lamps' radiance a little, and return the change (3,) of paint's base colours that makes up for it, as a logarithm.
+@torch.no_grad()
+def balance(state: State, paint: Tensor, hue: Tensor, mean: Tensor | None) -> None:
+    """Change lamps' radiance a little, and base colours of `paint` (N,) so that they make up for it.
 
-    The mean of `paint` (N,) is drawn to `mean`, and the light as a whole to the `hue` (3,), logarithms. The smaller the part of lamps is,
-    the less changes.
+    The mean of paint is drawn to `mean`, and the light as a whole to the `hue` (3,), logarithms. The smaller the part of lamps is, the less
+    changes.
     """
     radiance, whole, part = _lamps(state)
     change = 0.0 if mean is None else mean - _mean(state, paint)
@@ -272,7 +276,9 @@ def _balance(state: State, paint: Tensor, hue: Tensor, mean: Tensor | None) -> T
     step = part * (STEP * change).clamp(-MOST_STEP, MOST_STEP)
     raw = state.learned["environment"]
     raw.copy_(torch.where(radiance > CLIPPED, state.method.light.raw(_brighter(radiance, part, -step)), raw))
-    return step
+    raw = state.learned["albedo"]
+    color = plausible(raw.sigmoid() * step.exp())
+    raw.copy_(torch.where(paint[:, None], torch.logit(color), raw))
 
 
 @torch.no_grad()

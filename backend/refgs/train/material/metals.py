@@ -29,7 +29,7 @@ class Metals(Part):
     Of each surfel, remember whether hints hold its kind (`held`), whether photos tell it (`told`), how rough it is at most
     (`roughest`, see `gloss`), and the base colour that it keeps to (`shown_color`): of metal, what photos tell of it (see
     `base_colors.told`), and of paint, what it had learned when its shades were first kept. Checkpoints also keep `state.told_light`. It is
-    None unless photos tell base colours of some metals; without masks, they never do. `hue` (3,) is the light's
+    None unless photos tell base colours of metals that mirror enough of it; without masks, they never do. `hue` (3,) is the light's
     (`base_colors.told_hue`), and `mean` is that of paint (`base_colors.wanted`).
     """
 
@@ -95,8 +95,8 @@ def _judge(state: State, first: bool = False) -> None:
     told, painted = (kind.cpu() for kind in _told_kinds(state))  # hints' kinds, too
     shown.copy_(base_colors.told(found, told) * told[:, None])  # paint keeps to its own
     state.part(Metals).hue = base_colors.told_hue(found, painted).to(state.device)
-    colored = state.from_hull and bool(shown.any())
-    state.told_light = base_colors.told_light(found, told).to(state.device) if colored else None
+    light = base_colors.told_light(found, told) if state.from_hull and bool(shown.any()) else None
+    state.told_light = None if light is None else light.to(state.device)
     if raised.any():
         material = torch.logit(base_colors.plausible(like_metals(found))).to(metallic.device)
         albedo[raised], roughness[raised] = material[raised, :3], material[raised, 3]
@@ -170,20 +170,23 @@ def hold_as(state: State, kinds: torch.Tensor) -> None:
 
 def draw_metals(state: State, step: Step) -> None:
     """Draw base colours of metals to what photos tell."""
-    if _base_colors_kept(state):
+    if _metals_drawn(state):
         base_colors.draw(state, _told_kinds(state)[0])
 
 
 def level_base_colors(state: State, step: Step) -> None:
     """Keep mean base colours, and with them lamps, at what photos and experience tell, see `base_colors`."""
     part = state.part(Metals)
-    if _base_colors_kept(state):
-        base_colors.level(state, *_told_kinds(state), part.hue, part.mean)
+    if _metals_drawn(state):
+        metals, paint = _told_kinds(state)
+        base_colors.level(state, metals)
+        if _light_told(state):
+            base_colors.balance(state, paint, part.hue, part.mean)
 
 
 def compare_highlights(state: State, step: Step) -> None:
     """Learn from highlights, and from experience, how bright paint is in the mean."""
-    if _base_colors_kept(state):
+    if _light_told(state):
         part, paint = state.part(Metals), _told_kinds(state)[1]
         brighter = base_colors.with_brighter_lamps(state, paint, highlights.BRIGHTER)
         part.mean = base_colors.wanted(state, paint, highlights.compare(state, brighter, step.done), part.mean)
@@ -206,18 +209,24 @@ def keep_paint_glossy(state: State, step: Step) -> None:
 
 def average_paint(state: State, step: Step) -> None:
     """Average base colours of paint over neighbours, so that the light learns shades, and not the paint."""
-    if _base_colors_kept(state):
+    if _light_told(state):
         base_colors.average(state, _told_kinds(state)[1])
 
 
 def keep_shades(state: State, step: Step) -> None:
     """Keep shades of base colours, so that only what is finer learns."""
-    if _base_colors_kept(state):
-        base_colors.keep_shades(state, *_told_kinds(state))
+    if _metals_drawn(state):
+        metals, paint = _told_kinds(state)
+        base_colors.keep_shades(state, metals, paint & _light_told(state))
 
 
-def _base_colors_kept(state: State) -> bool:
-    """Tell whether photos tell base colours of metals, so that they tell the light."""
+def _metals_drawn(state: State) -> bool:
+    """Tell whether base colours of metals keep to what photos show of the object, if they do. That needs no light."""
+    return state.from_hull and {"albedo", "metallic"} <= state.learned.keys()
+
+
+def _light_told(state: State) -> bool:
+    """Tell whether metals tell enough of the light, so that paint has to follow it."""
     return state.told_light is not None and {"albedo", "metallic"} <= state.learned.keys()
 
 

@@ -132,6 +132,7 @@ def observe_changes(state: State) -> Observations:
 @torch.no_grad()
 def observe_mirrored(state: State, inputs: RenderInputs, views: list[int]) -> Seen:
     """Observe the surfels in the training photos `views`, with exposures divided out."""
+    inputs = inputs._replace(occluder=None)  # for normals, nothing needs to be traced
     sums = [_sums(state, inputs, view) for view in views]
     radiance, pixels, clipped, normal = torch.stack(sums, dim=1).cpu().split([3, 1, 3, 3], dim=2)
     towards = _towards(inputs.surfels, [state.photo(view) for view in views]).cpu()
