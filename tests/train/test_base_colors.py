@@ -125,6 +125,22 @@ def test_metals_are_drawn_to_what_they_show(start, tmp_path):
     assert torch.equal(again.learned["shown_color"], state.learned["shown_color"])
 
 
+def test_paint_is_left_alone_where_metals_do_not_tell_the_light(start, tmp_path):
+    shade = 0.1 + 0.2 * torch.rand(start.state.learned.count, 3, generator=torch.Generator().manual_seed(0))
+    state, metal = metal_and_paint(tmp_path / "run", start, shade)
+    state.told_light = None
+    state.learned["shown_color"].data.copy_(torch.tensor([0.9, 0.6, 0.3, 1.0]) * metal[:, None])
+    light = state.learned["environment"].detach().clone()
+    for _ in range(40):
+        for row in LEVEL, DRAW, "average paint's base colours":
+            do(state, row, 0.3, done=120)
+    do(state, KEEP, 0.7, done=280)
+    now = state.surfels().albedo.detach()
+    assert torch.allclose(now[metal], torch.tensor([0.9, 0.6, 0.3]), atol=1e-3), "that needs no light"
+    assert torch.allclose(now[~metal], shade[~metal], atol=1e-5)
+    assert torch.equal(state.learned["environment"], light)
+
+
 def test_later_metals_keep_their_level_and_learn_patterns(start, tmp_path):
     state, metal = metal_and_paint(tmp_path / "run", start, torch.tensor([0.3, 0.3, 0.3]))
     pattern = torch.where(torch.arange(len(metal)) % 2 > 0, 0.2, 0.4)[:, None].expand(-1, 3)

@@ -159,7 +159,7 @@ def draw(state: State, metals: Tensor) -> None:
     """Draw base colours of `metals` (N,) to what photos tell."""
     raw = state.learned["albedo"]
     logs, wrong, weight = _wrong(state, metals)
-    raw.copy_(torch.where(metals[:, None], torch.logit(plausible((logs + DRAWN * weight * wrong).exp())), raw))
+    raw.copy_(torch.where(weight > 0, torch.logit(plausible((logs + DRAWN * weight * wrong).exp())), raw))
 
 
 @torch.no_grad()
