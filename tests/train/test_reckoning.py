@@ -127,7 +127,7 @@ def test_a_metal_in_the_dark_is_told_by_what_it_mirrors_of_the_object(diffuse, r
     near = neighbours(torch.rand(count, 3, generator=generator), NEIGHBOURS)
     fits = mirrored.fit_both(seen, (([each] * 3, which) for each, which in zip(learned, met, strict=True)), near)
     values = reckoning.terms(
-        seen, fits, near, *reckoning.metal_reflectance(fits), *reckoning.mean_and_changes(seen, near)
+        seen, fits, near, *reckoning.told_by_object(fits.of_object), *reckoning.mean_and_changes(seen, near)
     )
     values["changing light"] = torch.zeros(count)
     assert bool((reckoning.log_odds(values) > 0).all()) == bool((reckoning.log_odds(values) > 0).any()) == metal
@@ -160,7 +160,7 @@ def test_photos_that_clip_a_surface_tell_what_it_is(diffuse, reflectance, metal)
         seen = Seen(shown.clamp_max(clip), shown > clip, weight, pixels, shown.mean(dim=1), up, up)
         fits = mirrored.fit_both(seen, (([each] * 3, which) for each, which in zip(light, met, strict=True)), near)
         return fits.everywhere, reckoning.terms(
-            seen, fits, near, *reckoning.metal_reflectance(fits), *reckoning.mean_and_changes(seen, near)
+            seen, fits, near, *reckoning.told_by_object(fits.of_object), *reckoning.mean_and_changes(seen, near)
         )
 
     (clipped, terms), (whole, all_terms) = fit(1.0), fit(math.inf)

@@ -27,19 +27,20 @@ from refgs.train.material.observe import (
 from refgs.train.state import State, why_not_traced
 
 WEIGHTS = {
-    "fall": 5.70,
-    "light's fall": -0.95,
-    "ratio": 2.86,
-    "reflectance": 5.56,
-    "object's ratio": 3.38,
-    "object's reflectance": 4.32,
-    "tint": 2.12,
-    "grey": 1.78,
-    "no metal's colour": -4.94,
-    "too dark for metal": -3.22,
-    "changing light": -28.44,
+    "fall": 5.58,
+    "light's fall": -0.77,
+    "ratio": 2.77,
+    "reflectance": 4.62,
+    "object's ratio": 2.95,
+    "object's reflectance": 6.02,
+    "tint": 1.86,
+    "grey": 2.25,
+    "no metal's colour": -2.12,
+    "no metal's colour, by the object": -2.65,
+    "too dark for metal": -2.89,
+    "changing light": -24.87,
 }
-BIAS = -3.99
+BIAS = -4.26
 LOW = 0.1  # quantile over the photos
 DARKEST = 1e-4  # radiance: photos tell no darker ones apart
 MOST_FALL, MOST_RATIO = 2.5, 1.5  # terms that are larger tell no more
@@ -50,7 +51,7 @@ CHANGES = 0.15  # relative change from which on its colour tells fully
 # silver, aluminium, titanium, iron and bronze lie.
 METALS = (0.654, 0.685, 0.701), (0.910, 0.778, 0.423), (1.059, 0.773, 0.307), (0.932, 0.623, 0.522)
 FOREIGN = 0.05  # distance of a chromaticity from those of metals; farther ones tell no more. A metal's is wrong by 0.02 where normals err
-DULL = 0.6  # F0 in the brightest channel from which on a metal is not dull: iron has 0.53, titanium 0.44, the other seven at least 0.7
+MOST_DARK = 1.0  # logarithm below a reflectance of 1; titanium is the darkest metal, 0.8 below
 LIKE = 0.01  # weight of a metal's material if it is only fitted, relative to a learned one
 
 
@@ -102,8 +103,9 @@ def reckon(state: State) -> Reckoned:
     graph = same_material.laplacian(surfels.positions, seen, near)
     shown, changes = mean_and_changes(seen, near)
     every, of_object = fits.everywhere, fits.of_object
-    reflectance, by_object = metal_reflectance(fits)
-    values = terms(seen, fits, near, reflectance, by_object, shown, changes)
+    level, by_object = told_by_object(of_object)
+    reflectance = torch.where(by_object[:, None], level.clamp_max(1), every.reflectance)
+    values = terms(seen, fits, near, level, by_object, shown, changes)
     values["changing light"] = torch.full_like(seen.pixels, changing_light.lead(state, near))
     known = (seen.pixels > same_material.FRINGE) & (every.pixels > ENOUGH_PIXELS) & (every.exact > LEAST_PIXELS)
     metal = same_material.spread(graph, log_odds(values), known.float()).sigmoid()
@@ -115,12 +117,13 @@ def reckon(state: State) -> Reckoned:
     )
 
 
-def metal_reflectance(fits: mirrored.Mirrored) -> tuple[Tensor, Tensor]:
-    """Return the reflectance (N, 3) of the metal that explains the photos best, and whether what it mirrors of the object tells it (N,)."""
-    every, of_object = fits.everywhere, fits.of_object
-    by_object = (of_object.exact > ENOUGH_PIXELS) & (of_object.white.mean(dim=1) > LEAST_SHOWN * of_object.exact)
-    level = (of_object.reflected / of_object.white.clamp_min(1e-6)).clamp(0, 1)
-    return torch.where(by_object[:, None], level, every.reflectance), by_object
+def told_by_object(of_object: mirrored.Fit) -> tuple[Tensor, Tensor]:
+    """Return the reflectance (N, 3) of a metal that shows what a surfel does of the object, and whether photos tell it (N,).
+
+    It does not depend on the light. It is above 1 where a surfel is brighter than what it mirrors.
+    """
+    known = (of_object.exact > ENOUGH_PIXELS) & (of_object.white.mean(dim=1) > LEAST_SHOWN * of_object.exact)
+    return (of_object.reflected / of_object.white.clamp_min(1e-6)).clamp_min(0), known
 
 
 def log_odds(values: dict[str, Tensor]) -> Tensor:
@@ -132,15 +135,15 @@ def terms(
     seen: Seen,
     fits: mirrored.Mirrored,
     near: Tensor,
-    reflectance: Tensor,
+    level: Tensor,
     by_object: Tensor,
     shown: Tensor,
     changes: Tensor,
 ) -> dict[str, Tensor]:
     """Compute the terms (N,) that compare what each surfel shows with what it mirrors.
 
-    `near` (N, K) are neighbours to average over; `shown` and `changes` is what they show (`mean_and_changes`). `reflectance` (N, 3) is that
-    of the best metal, and `by_object` (N,) tells whether it does not depend on the light (`metal_reflectance`).
+    `near` (N, K) are neighbours to average over; `shown` and `changes` is what they show (`mean_and_changes`). `level` (N, 3) is what the
+    object tells of the reflectance of a metal, and `by_object` (N,) where it does (`told_by_object`).
 
     - fall: how far the darkest tenth of the photos is below the median, as a logarithm. A metal has no diffuse radiance, so it may be far
       darker than its median. Clipped photos count: what is brighter than the median does not change it.
@@ -148,8 +151,8 @@ def terms(
     - ratio, reflectance: see `mirrored.Fit`, by the light and, as "object's …", by photos in which the surfel mirrors the object
     - tint: whether the radiance changes along the surface's own colour (1), as a coloured metal's, or along grey (0)
     - grey: 1 where the surface has no colour, so that its tint tells nothing
-    - no metal's colour: how far `reflectance` is from that of all metals, from 0 to 1 (`from_metals`)
-    - too dark for metal: how far it is below DULL, from 0 to 1, where it does not depend on the light
+    - no metal's colour: how far the reflectance is from that of all metals, from 0 to 1 (`from_metals`), by the light and by the object
+    - too dark for metal: how far `level` is below 1 in its brightest channel, as a logarithm from 0 to MOST_DARK
 
     One more, "changing light", is a number for the whole object (`changing_light.lead`).
     """
@@ -165,8 +168,9 @@ def terms(
         "object's reflectance": met * of_object.reflectance.amax(dim=1),
         "tint": tint,
         "grey": grey,
-        "no metal's colour": from_metals(reflectance) / FOREIGN,
-        "too dark for metal": by_object * (1 - reflectance.amax(dim=1) / DULL).clamp_min(0),
+        "no metal's colour": from_metals(every.reflectance) / FOREIGN,
+        "no metal's colour, by the object": by_object * from_metals(level) / FOREIGN,
+        "too dark for metal": by_object * (-level.amax(dim=1).clamp_min(1e-3).log()).clamp(0, MOST_DARK),
     }
 
 
