@@ -52,9 +52,7 @@ PAINT = 0.34  # all paint's brightest channel in the mean, as far as highlights 
 PAINTS = 0.66  # standard deviation of its natural logarithm in 21 rendered scenes
 HUES = 0.13  # standard deviation of the logarithms of a light's hue: Blender's eight HDRIs have this
 PARTS_HUES = 0.1  # the same of what highlights show of a light, around the hue of all of it: 18 rendered scenes
-LEAST_TOLD = (
-    1 / 3
-)  # fraction of the light's texels that metals must mirror, so that it is known: a flat mirror tells 0.4, seen from above
+LEAST_TOLD = 1 / 3  # fraction of the light's texels that metals must mirror: a flat mirror, seen from above, has 0.4
 LEAST_MIRRORED = 2.0  # pixels that must mirror a texel of the coarse cubemap, so that they tell its radiance
 STEP, MOST_STEP = 0.3, 0.1  # part of the way to balance, each time, and the largest step: logarithms
 TOWARDS = 0.4  # part of the way to what highlights tell, each time that they are compared
