@@ -227,7 +227,7 @@ def _metals_drawn(state: State) -> bool:
 
 def _light_told(state: State) -> bool:
     """Tell whether metals tell enough of the light, so that paint has to follow it."""
-    return state.told_light is not None and {"albedo", "metallic"} <= state.learned.keys()
+    return state.told_light is not None and _metals_drawn(state)
 
 
 def _gloss_learns(state: State) -> bool:

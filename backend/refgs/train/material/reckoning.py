@@ -43,7 +43,8 @@ WEIGHTS = {
 BIAS = -4.26
 LOW = 0.1  # quantile over the photos
 DARKEST = 1e-4  # radiance: photos tell no darker ones apart
-MOST_FALL, MOST_RATIO = 2.5, 1.5  # terms that are larger tell no more
+# Terms that are larger tell no more. The darkest metal, titanium, is 0.8 dark.
+MOST_FALL, MOST_RATIO, MOST_DARK = 2.5, 1.5, 1.0
 ENOUGH_PIXELS = 30.0  # the neighbours' pixels in all photos from which on what they mirror of the object tells
 LEAST_SHOWN = 0.02  # least mean radiance of what a surfel mirrors of the object: in less, errors tell more
 CHANGES = 0.15  # relative change from which on its colour tells fully
@@ -51,7 +52,6 @@ CHANGES = 0.15  # relative change from which on its colour tells fully
 # silver, aluminium, titanium, iron and bronze lie.
 METALS = (0.654, 0.685, 0.701), (0.910, 0.778, 0.423), (1.059, 0.773, 0.307), (0.932, 0.623, 0.522)
 FOREIGN = 0.05  # distance of a chromaticity from those of metals; farther ones tell no more. A metal's is wrong by 0.02 where normals err
-MOST_DARK = 1.0  # logarithm below a reflectance of 1; titanium is the darkest metal, 0.8 below
 LIKE = 0.01  # weight of a metal's material if it is only fitted, relative to a learned one
 
 
@@ -170,7 +170,7 @@ def terms(
         "grey": grey,
         "no metal's colour": from_metals(every.reflectance) / FOREIGN,
         "no metal's colour, by the object": by_object * from_metals(level) / FOREIGN,
-        "too dark for metal": by_object * (-level.amax(dim=1).clamp_min(1e-3).log()).clamp(0, MOST_DARK),
+        "too dark for metal": by_object * (-level.amax(dim=1).log()).clamp(0, MOST_DARK),
     }
 
 
