@@ -421,6 +421,17 @@ def test_metallic_is_held_at_the_likelier_kind_even_in_doubt(made, monkeypatch, 
     assert (made.state.learned["told"] == (kind is not None)).all()
 
 
+@pytest.mark.parametrize("likely, kind", [(0.7, None), (0.3, None), (0.8, 0), (0.2, 1)])
+def test_metallic_learns_on_after_the_first_look_where_there_is_doubt(made, monkeypatch, likely, kind):
+    in_doubt(made, monkeypatch, likely)
+    put(made, metallic=0.0)
+    made.state.part(metals.Metals).found = False
+    do(made.state, "find metals", 0.25, done=150)
+    value = torch.tensor(0.0 if kind is None else raw_metallic(metals.HELD[kind]))
+    assert (made.state.learned["metallic"] == value).all()
+    assert (made.state.learned["told"] == (kind is not None)).all()
+
+
 def test_a_metallic_that_has_the_held_value_by_chance_still_learns(ball_capture, tmp_path):
     made = small(ball_capture, tmp_path / "run", "train.light_first=0", total=100)
     put(made, metallic=raw_metallic(metals.HELD.metal))

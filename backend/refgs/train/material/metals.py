@@ -77,7 +77,8 @@ def judge(state: State, step: Step) -> None:
 def _judge(state: State, first: bool = False) -> None:
     """Set metallic to the likelier kind, and hold it there until the next look. Hints hold theirs. It learns where no photo tells.
 
-    It does not learn where photos leave doubt, either: training turns metal into paint, by changing the light.
+    It does not learn where photos leave doubt, either: training turns metal into paint, by changing the light. But the first time, shapes
+    are wrong, and paint that is taken for metal spoils them for good. So metallic learns on until the next look where there is doubt.
 
     A surfel that was taken for paint, but is metal, takes the base colour and roughness of the metals around it. An example is the lower
     half of a ball on a table: it mirrors only the table, so it has learned the table's colour as its own. The first time, all metals take
@@ -87,7 +88,8 @@ def _judge(state: State, first: bool = False) -> None:
     metallic, albedo, roughness = (state.learned[name] for name in ("metallic", "albedo", "roughness"))
     free, likely = ~state.learned["held"], found.metal.to(metallic.device)
     was = state.surfels().metallic > 0.5
-    metal, paint = free & (likely > 0.5), free & (likely < 0.5)
+    sure = 1 - questions.DOUBTFUL / 2 if first else 0.5
+    metal, paint = free & (likely > sure), free & (likely < 1 - sure)
     raised, lowered = metal & ~was, paint & was
     metallic[metal], metallic[paint] = raw_metallic(HELD.metal), raw_metallic(HELD.paint)
     state.learned["told"].copy_(metal | paint)
@@ -112,9 +114,8 @@ def _judge(state: State, first: bool = False) -> None:
     for name in ("albedo", "roughness"):
         state.learned.forget(name, raised | lowered)
     state.learned.forget("metallic", metal | paint)
-    now = state.surfels()
     whole = max(float(found.pixels.sum()), 1e-6)
-    kinds = now.metallic > 0.5, raised, lowered
+    kinds = told, raised, lowered
     metals, more, less = (float(found.pixels[which.cpu()].sum()) / whole for which in kinds)
     words = (
         f"{metals:.0%} of the surface is metal: {more:.1%} had been taken for paint, and {less:.1%} is paint after all"
