@@ -103,8 +103,8 @@ def _untrimmed(mesh: trimesh.Trimesh) -> np.ndarray:
 
 def _border(mesh: trimesh.Trimesh) -> np.ndarray:
     """Return the edges (B, 2) of one face only, in the face's winding order."""
-    _, edge, faces = np.unique(mesh.edges_sorted, axis=0, return_inverse=True, return_counts=True)
-    return mesh.edges[faces[edge.reshape(-1)] == 1]
+    edge = mesh.edges_unique_inverse
+    return mesh.edges[np.bincount(edge)[edge] == 1]
 
 
 def _grown(marked: np.ndarray, faces: np.ndarray, rings: int) -> np.ndarray:
@@ -119,8 +119,7 @@ def _grown(marked: np.ndarray, faces: np.ndarray, rings: int) -> np.ndarray:
 def _manifold(mesh: trimesh.Trimesh) -> np.ndarray:
     """Mark the faces (F,) to keep so that no edge has more than two faces."""
     # Edges with three faces arise when simplification folds a thin part of the mesh. The two largest are kept.
-    _, edge = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
-    edge, face = edge.reshape(-1), mesh.edges_face
+    edge, face = mesh.edges_unique_inverse, mesh.edges_face
     order = np.lexsort((-mesh.area_faces[face], edge))
     start = np.r_[0, np.flatnonzero(np.diff(edge[order])) + 1]
     place = np.arange(len(order)) - np.repeat(start, np.diff(np.r_[start, len(order)]))
