@@ -16,6 +16,9 @@ from refgs.train.keep.asset import write_asset
 from refgs.train.learn.densify import Densification, densify
 from refgs.train.material import metals, mirrored, questions, reckoning
 from refgs.train.material.observe import NEIGHBOURS, Seen, neighbours
+from refgs.train.plan import Plan
+from refgs.train.state import State
+from refgs.train.timeline import metals_judged_again
 from refgs.train.trainer import ACTIONS
 from tests.makers.lamps import LAMPS, ORANGE, show
 from tests.makers.pieces import ball_on_board, reckoned
@@ -421,15 +424,36 @@ def test_metallic_is_held_at_the_likelier_kind_even_in_doubt(made, monkeypatch, 
     assert (made.state.learned["told"] == (kind is not None)).all()
 
 
-@pytest.mark.parametrize("likely, kind", [(0.7, None), (0.3, None), (0.8, 0), (0.2, 1)])
-def test_metallic_learns_on_after_the_first_look_where_there_is_doubt(made, monkeypatch, likely, kind):
+@pytest.mark.parametrize(
+    "likely, again, kind",
+    [(0.7, True, None), (0.3, True, None), (0.8, True, 0), (0.2, True, 1), (0.7, False, 0), (0.3, False, 1)],
+)
+def test_metallic_learns_on_after_the_first_look_where_there_is_doubt(made, monkeypatch, likely, again, kind):
+    """Check that what is in doubt is neither metal nor paint until the next look, if there will be one."""
     in_doubt(made, monkeypatch, likely)
+    state = made.state
     put(made, metallic=0.0)
-    made.state.part(metals.Metals).found = False
-    do(made.state, "find metals", 0.25, done=150)
+    state.change("indirect.every", 100 if again else state.total, "plan", "the test says so")
+    state.part(metals.Metals).found = False
+    do(state, "find metals", 0.25, done=150)
     value = torch.tensor(0.0 if kind is None else raw_metallic(metals.HELD[kind]))
-    assert (made.state.learned["metallic"] == value).all()
-    assert (made.state.learned["told"] == (kind is not None)).all()
+    assert (state.learned["metallic"] == value).all()
+    assert (state.learned["told"] == (kind is not None)).all()
+
+
+def test_metals_are_judged_again_with_masks_meshes_and_time(made, monkeypatch):
+    """Check 400 iterations with a mesh every 100: the residual learns from 340 on, and in a minute judging would take 300 of them."""
+    state = made.state
+    state.change("indirect.every", 100, "plan", "the test says so")
+    state.iteration = 299
+    assert metals_judged_again(state)
+    state.iteration = 300
+    assert not metals_judged_again(state)
+    state.iteration, state.plan = 150, Plan(1.0)
+    assert not metals_judged_again(state) and "judge metals" in state.plan.left_out
+    state.plan = Plan(None)
+    monkeypatch.setattr(State, "from_hull", False)
+    assert not metals_judged_again(state)
 
 
 def test_a_metallic_that_has_the_held_value_by_chance_still_learns(ball_capture, tmp_path):

@@ -162,6 +162,13 @@ def metals_decidable(state: State, done: int) -> bool:
     return settings.render.reflection == "microfacet" and not settings.propagation.every and decidable(state, done)
 
 
+def metals_judged_again(state: State) -> bool:
+    """Tell whether metals will be judged again: not without masks, not without another mesh, and not where that takes too much time."""
+    period = JUDGE.length(state) if why_not_traced(state) else state.settings.indirect.every
+    following = (state.iteration // period + 1) * period if period else state.total
+    return state.from_hull and following < state.residual_start * state.total and JUDGE_METALS.pays(state)
+
+
 def since_propagation(state: State, done: int) -> int | None:
     """Count the iterations since normals were propagated; None before this begins or after it ends."""
     settings = state.settings.propagation
@@ -287,6 +294,9 @@ FROZEN = (
 )
 """Tensors that do not learn, and the row that says when."""
 
+JUDGE_METALS = Row(
+    "judge metals", until=RESIDUAL, only_if=JUDGED & FROM_HULL & METALS, clock="deciding", cost=300, most=SHAPES
+)
 AFTER = (
     Row("refine the view's pose", part(POSES_FROM), part(POSES_UNTIL)),
     Row("remove the poses' common motion", part(POSES_FROM), part(POSES_UNTIL), Every("views", lambda s: len(s.views))),
@@ -319,14 +329,7 @@ AFTER = (
         cost=180,
         most=SHAPES,
     ),
-    Row(
-        "judge metals",
-        until=RESIDUAL,
-        only_if=JUDGED & FROM_HULL & METALS,
-        clock="deciding",
-        cost=300,
-        most=SHAPES,
-    ),
+    JUDGE_METALS,
     Row("even coloured metal out", None, part(0.6), iterations(50)),
     Row("find glossy paint", part(0.4), RESIDUAL, share(0.085), clock="deciding", cost=13),
     Row("keep paint glossy", part(0.4), RESIDUAL, iterations(10)),

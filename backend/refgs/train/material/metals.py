@@ -16,7 +16,7 @@ from refgs.train.material.observe import Kinds
 from refgs.train.material.reckoning import like_metals, reckon
 from refgs.train.part import Fact, Part
 from refgs.train.state import State
-from refgs.train.timeline import Step, metals_decidable
+from refgs.train.timeline import Step, metals_decidable, metals_judged_again
 
 HELD = Kinds(metal=0.98, paint=0.002)  # metallic that does not learn, in the order of `hints.KINDS`
 SHARP = Kinds(metal=0.1, paint=gloss.LEAST)  # roughness from which surfels learn, at most, once metals are found
@@ -78,7 +78,8 @@ def _judge(state: State, first: bool = False) -> None:
     """Set metallic to the likelier kind, and hold it there until the next look. Hints hold theirs. It learns where no photo tells.
 
     It does not learn where photos leave doubt, either: training turns metal into paint, by changing the light. But the first time, shapes
-    are wrong, and paint that is taken for metal spoils them for good. So metallic learns on until the next look where there is doubt.
+    are wrong, and paint that is taken for metal spoils them for good. So if there will be another look, metallic learns until then where
+    there is doubt.
 
     A surfel that was taken for paint, but is metal, takes the base colour and roughness of the metals around it. An example is the lower
     half of a ball on a table: it mirrors only the table, so it has learned the table's colour as its own. The first time, all metals take
@@ -88,7 +89,7 @@ def _judge(state: State, first: bool = False) -> None:
     metallic, albedo, roughness = (state.learned[name] for name in ("metallic", "albedo", "roughness"))
     free, likely = ~state.learned["held"], found.metal.to(metallic.device)
     was = state.surfels().metallic > 0.5
-    sure = 1 - questions.DOUBTFUL / 2 if first else 0.5
+    sure = 1 - questions.DOUBTFUL / 2 if first and metals_judged_again(state) else 0.5
     metal, paint = free & (likely > sure), free & (likely < 1 - sure)
     raised, lowered = metal & ~was, paint & was
     metallic[metal], metallic[paint] = raw_metallic(HELD.metal), raw_metallic(HELD.paint)
