@@ -104,9 +104,11 @@ struct Displaced {
     for (int c = 0; c < S; c++) value[c] = c < ALBEDO ? scale * sampled[c] + (1.0f - trust) * own[c] : own[c];
   }
 
-  // Pass on the derivatives by `value` and by the pixel's alpha.
+  MEMBER Vector blended(int c) const { return mean.value[c]; }
+
+  // Pass on the derivatives by `value`, by the blended normal and by the pixel's alpha.
   template <class Sums>
-  MEMBER void backward(const Shade& s, const Vector (&by_value)[S], Vector by_alpha, Sums& sums) const {
+  MEMBER void backward(const Shade& s, const Vector (&by_value)[S], const Vector (&by_blended)[3], Vector by_alpha, Sums& sums) const {
     Vector by_sampled[4], by_own[C], by_there = {}, by_u = {}, by_v = {};
     for (int c = 0; c < ALBEDO; c++) {
       by_sampled[c] = scale * by_value[c];
@@ -119,7 +121,7 @@ struct Displaced {
     Vector by_camera_x = s.fx * inverse_z * by_px, by_camera_y = s.fy * inverse_z * by_py;
     Vector by_z = -inverse_z * (px * by_px + py * by_py);
     for (int i = 0; i < 3; i++) by_own[S + i] = s.view[i] * by_camera_x + s.view[4 + i] * by_camera_y + s.view[8 + i] * by_z;
-    for (int c = 0; c < S; c++) by_own[c] = c < ALBEDO ? (1.0f - trust) * by_value[c] : by_value[c];
+    for (int c = 0; c < S; c++) by_own[c] = c < ALBEDO ? (1.0f - trust) * by_value[c] + by_blended[c] : by_value[c];
     mean.backward(by_own, by_alpha, sums);
     sums.add_sampled(corners, pixels.count, by_sampled);
   }
@@ -133,6 +135,8 @@ struct Own {
   Vector alpha, value[C];
 
   MEMBER Own(const Shade& s, const Pixels& p) : pixels(p), alpha(Vector() + 1.0f) { gather<C>(s.features, p, value); }
+
+  MEMBER Vector blended(int c) const { return value[c]; }
 
   MEMBER Vectors to_camera(const Shade& s) const {
     const float* m = s.view;

@@ -53,6 +53,8 @@ INLINE void write_pixels(const Shade& s, const Map& map, const Vector (&radiance
 // HARMONICS: directional colour replaces the reflected irradiance.
 // INDIRECT: light from the object itself where it occludes the mirror direction (Eq. 9), and its shadow on the irradiance.
 // SPLATS: pixels are surfels.
+// Irradiance varies too slowly with the normal to need Displaced's. It uses the blended normal, as what is matte does: the derivative by the
+// displacement would move surfels to and fro at edges between normals, which spoils shapes.
 // Directions are in the light's frame, because the light may turn with the camera.
 template <bool HARMONICS, bool INDIRECT, bool SPLATS, bool DERIVATIVES>
 struct Shaded {
@@ -60,8 +62,8 @@ struct Shaded {
   static constexpr int DIFFUSE = 8, FROM_OBJECT = INDIRECT ? 11 : 0;  // channels: directional colour or shadow; the object's light
   static constexpr int C = 11 + 3 * (HARMONICS || INDIRECT) + 3 * INDIRECT, S = C - 3;
   Map<SPLATS, C, DERIVATIVES> map;
-  Vector inverse_length, n_dot_v, visibility;
-  Vectors normal, view;
+  Vector inverse_length, inverse_blended, n_dot_v, visibility;
+  Vectors normal, blended, view;
   Lookup<2, DERIVATIVES> lookup;
   Lookup<1, DERIVATIVES> irradiance;
   ReflectanceTable table;
@@ -71,10 +73,12 @@ struct Shaded {
   MEMBER Shaded(const Shade& s, const Pixels& pixels)
       : map(s, pixels),
         inverse_length(inverse_norm({map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
+        inverse_blended(inverse_norm({map.blended(NORMAL), map.blended(NORMAL + 1), map.blended(NORMAL + 2)})),
         normal(inverse_length * turned(s.turn, {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
+        blended(inverse_blended * turned(s.turn, {map.blended(NORMAL), map.blended(NORMAL + 1), map.blended(NORMAL + 2)})),
         view(turned(s.turn, seen_from(s))),
         lookup(s.levels, mirrored(), s.mirror ? Vector() : map.value[ROUGHNESS]),
-        irradiance(s.levels, normal),
+        irradiance(s.levels, blended),
         table(s.reflectance, s.reflectance_side, n_dot_v, map.value[ROUGHNESS]),
         exposure{s.exposure[0], s.exposure[1], s.exposure[2]} {
     const auto& v = map.value;
@@ -147,7 +151,13 @@ struct Shaded {
         if (SHADOW) by[DIFFUSE + c] = by_irradiance[c] * irradiance.light[c], by_irradiance[c] *= v[DIFFUSE + c];
       }
     }
-    if (!HARMONICS) by_n = irradiance.backward(by_irradiance), sums.add_light(irradiance, map.pixels.count, by_irradiance);
+    Vector by_blended[3] = {};
+    if (!HARMONICS) {
+      Vectors by_b = irradiance.backward(by_irradiance);
+      by_b = turned_back(s.turn, inverse_blended * (by_b - dot(by_b, blended) * blended));
+      by_blended[0] = by_b.x, by_blended[1] = by_b.y, by_blended[2] = by_b.z;
+      sums.add_light(irradiance, map.pixels.count, by_irradiance);
+    }
     sums.add_exposure(by_exposure);
     Vector by_n_v = {};
     for (int i = 0; i < 4; i++) {
@@ -166,11 +176,11 @@ struct Shaded {
       Vectors by_view = by_dot * normal - by_mirrored;
       by_view = turned_back(s.turn, inverse_norm(map.to_camera(s)) * (by_view - dot(by_view, view) * view));
       Vector by_own[C] = {};
-      for (int c = 0; c < S; c++) by_own[c] = by[c];
+      for (int c = 0; c < S; c++) by_own[c] = c < ALBEDO ? by[c] + by_blended[c] : by[c];
       by_own[S] = -by_view.x, by_own[S + 1] = -by_view.y, by_own[S + 2] = -by_view.z;
       sums.add_own(map.pixels, by_own, by_alpha);
     } else {
-      map.backward(s, by, by_alpha, sums);
+      map.backward(s, by, by_blended, by_alpha, sums);
     }
   }
 
@@ -192,9 +202,7 @@ struct Shaded {
   MEMBER Vectors mirrored() { return mirror(normal, view, n_dot_v); }
 };
 
-// Shading of a matte surface: albedo times irradiance, for LANES pixels or surfels (SPLATS). It uses the blended normal, not Displaced's:
-// irradiance varies too slowly with the normal to need that. With the blended normal, normals and relit images were better, and photos were
-// fitted as well.
+// Shading of a matte surface: albedo times irradiance, for LANES pixels or surfels (SPLATS).
 template <bool SPLATS, bool DERIVATIVES>
 struct Matte {
   static constexpr int C = 6;  // normal, albedo

@@ -134,7 +134,7 @@ def shade(
     towards = -unit(ray @ view[:3, :3])
     indirect = None if visibility is None else (visibility[pixels][:, None], maps[:, 11:])
     given = levels, sides, indirect, margins, turn, mirror, matte
-    radiance = radiance_towards(towards, maps, maps[:, 8:11] if by_direction else None, *given)
+    radiance = radiance_towards(towards, maps, maps[:, 8:11] if by_direction else None, *given, blended=own[:, :3])
     exposed = exposure * radiance
     if not display:
         margins.append((exposed - 0.0031308).abs().amin(dim=-1))
@@ -175,6 +175,7 @@ def radiance_towards(
     turn: Tensor | None = None,
     mirror: bool = False,
     matte: bool = False,
+    blended: Tensor | None = None,
 ) -> Tensor:
     """Compute the radiance (P, 3) that P surface points send in unit directions `towards` (P, 3), by the split sum.
 
@@ -187,6 +188,7 @@ def radiance_towards(
       second (P, 3) is the radiance that comes from the object in this direction.
     - `margins`: a list, to which distances from jumps of the derivatives are appended (see `shade`)
     - `mirror`, `matte`: as in `refgs.render.shade.shade`
+    - `blended` (P, 3): normals for irradiance, or None for those in `maps`
     """
     normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
     if turn is not None:
@@ -212,8 +214,11 @@ def radiance_towards(
     if appearance is not None:
         diffuse = (1 - share) * appearance
     else:
-        received = prefilter.irradiance(levels, sides, normal)
-        _cube_margins(normal, [torch.tensor(sides[-1])], margins)
+        facing = normal
+        if blended is not None:
+            facing = unit(blended) if turn is None else unit(blended) @ turn.T
+        received = prefilter.irradiance(levels, sides, facing)
+        _cube_margins(facing, [torch.tensor(sides[-1])], margins)
         reaching = 1 if indirect is None else maps[:, 8:11]
         diffuse = (1 - share) * (1 - dielectric) * albedo * received * reaching
     return light * ((1 - share) * dielectric + share * metal) + diffuse
