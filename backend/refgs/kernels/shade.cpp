@@ -54,7 +54,7 @@ INLINE void write_pixels(const Shade& s, const Map& map, const Vector (&radiance
 // INDIRECT: light from the object itself where it occludes the mirror direction (Eq. 9), and its shadow on the irradiance.
 // SPLATS: pixels are surfels.
 // Irradiance varies too slowly with the normal to need Displaced's. It uses the blended normal, as what is matte does: the derivative by the
-// displacement would move surfels to and fro at edges between normals, which spoils shapes.
+// displacement would move surfels wherever neighbouring normals differ, and photos were fitted less well.
 // Directions are in the light's frame, because the light may turn with the camera.
 template <bool HARMONICS, bool INDIRECT, bool SPLATS, bool DERIVATIVES>
 struct Shaded {
