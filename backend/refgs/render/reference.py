@@ -191,8 +191,9 @@ def radiance_towards(
     - `blended` (P, 3): normals for irradiance, or None for those in `maps`
     """
     normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
+    facing = normal if blended is None else unit(blended)
     if turn is not None:
-        normal, towards = normal @ turn.T, towards @ turn.T
+        normal, facing, towards = normal @ turn.T, facing @ turn.T, towards @ turn.T
     if matte:
         _cube_margins(normal, [torch.tensor(sides[-1])], margins)
         return albedo * prefilter.irradiance(levels, sides, normal)
@@ -214,9 +215,6 @@ def radiance_towards(
     if appearance is not None:
         diffuse = (1 - share) * appearance
     else:
-        facing = normal
-        if blended is not None:
-            facing = unit(blended) if turn is None else unit(blended) @ turn.T
         received = prefilter.irradiance(levels, sides, facing)
         _cube_margins(facing, [torch.tensor(sides[-1])], margins)
         reaching = 1 if indirect is None else maps[:, 8:11]

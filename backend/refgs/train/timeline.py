@@ -165,7 +165,7 @@ def metals_decidable(state: State, done: int) -> bool:
 def metals_judged_again(state: State) -> bool:
     """Tell whether metals will be judged again: not without masks, not without another mesh, and not where that takes too much time."""
     period = JUDGE.length(state) if why_not_traced(state) else state.settings.indirect.every
-    following = (state.iteration // period + 1) * period if period else state.total
+    following = (state.iteration // period + 1) * period
     return state.from_hull and following < state.residual_start * state.total and JUDGE_METALS.pays(state)
 
 
