@@ -97,8 +97,11 @@ struct Displaced {
     Vector above = load(a[0]) + corners.x * across;
     there_by_x = across + corners.y * (across_below - across), there_by_y = load(a[2]) + corners.x * across_below - above;
     there = above + corners.y * there_by_y;
-    // At a silhouette the displaced pixel may lie off the object. Where its alpha is low, fall back to the pixel's own normal.
-    trust = clamp((there - SHIFT_ALPHA) * (1 / SHIFT_ALPHA), 0, 1);
+    // At a silhouette the displaced pixel may lie off the object. Where its alpha is low, fall back to the pixel's own normal. So do where
+    // the two normals differ: on a smooth surface they hardly do, and beyond an edge the displaced one is that of another surface.
+    Vectors moved = {sampled[0], sampled[1], sampled[2]}, normal = {own[NORMAL], own[NORMAL + 1], own[NORMAL + 2]};
+    Vector apart = larger(1.0f - dot(moved, normal) * inverse_norm(moved) * inverse_norm(normal), Vector());
+    trust = clamp((there - SHIFT_ALPHA) * (1 / SHIFT_ALPHA), 0, 1) * (SHIFT_APART / (SHIFT_APART + apart));
     inverse_there = reciprocal(larger(there, Vector() + SHIFT_ALPHA));
     scale = trust * inverse_there;
     for (int c = 0; c < S; c++) value[c] = c < ALBEDO ? scale * sampled[c] + (1.0f - trust) * own[c] : own[c];

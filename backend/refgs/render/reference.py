@@ -15,7 +15,7 @@ from refgs.model import cubemap, prefilter
 from refgs.render.brdf import LEAST_N_V, reflectance, reflectance_table
 
 ALPHA_CUT, ALPHA_CAP, MIN_TRANSMITTANCE, LOW_PASS, FAR = 1 / 255, 0.99, 1e-4, 8.0, 1e12  # as in splat.h
-COVERED, SHIFT_LIMIT, SHIFT_ALPHA = 1 / 255, 8.0, 0.3  # as in pixels.h
+COVERED, SHIFT_LIMIT, SHIFT_ALPHA, SHIFT_APART = 1 / 255, 8.0, 0.3, 0.03  # as in pixels.h
 
 
 def rotation_matrices(q: Tensor) -> Tensor:
@@ -249,8 +249,10 @@ def _displaced(features, alpha, own, pixels, camera: Camera, margins: list[Tenso
     sampled = cast(Tensor, sum(w[:, None] * c for w, c in zip(weights, corners, strict=True)))
     there = sampled[:, -1]
     margins += [(there - SHIFT_ALPHA).abs()]
-    trust = ((there - SHIFT_ALPHA) / SHIFT_ALPHA).clamp(0, 1).detach()[:, None]
     moved = sampled[:, :-1] / there.clamp_min(SHIFT_ALPHA)[:, None]
+    apart = (1 - torch.cosine_similarity(moved, own[:, :3], eps=1e-12)).clamp_min(0)
+    trust = ((there - SHIFT_ALPHA) / SHIFT_ALPHA).clamp(0, 1) * SHIFT_APART / (SHIFT_APART + apart)
+    trust = trust.detach()[:, None]
     return torch.cat([trust * moved + (1 - trust) * own[:, :3], own[:, 3:-3]], dim=-1)
 
 
