@@ -8,6 +8,9 @@ namespace {
 
 INLINE Vector inverse_norm(Vectors n) { return inverse_root(dot(n, n) + 1e-24f); }
 
+// The normal among a pixel's channels.
+INLINE Vectors normal_of(const Vector* value) { return {value[NORMAL], value[NORMAL + 1], value[NORMAL + 2]}; }
+
 // Blended means: the sums over a pixel's splats divided by alpha, C channels.
 template <int C>
 struct Mean {
@@ -99,7 +102,7 @@ struct Displaced {
     there = above + corners.y * there_by_y;
     // At a silhouette the displaced pixel may lie off the object. Where its alpha is low, fall back to the pixel's own normal. So do where
     // the two normals differ: on a smooth surface they hardly do, and beyond an edge the displaced one is that of another surface.
-    Vectors moved = {sampled[0], sampled[1], sampled[2]}, normal = {own[NORMAL], own[NORMAL + 1], own[NORMAL + 2]};
+    Vectors moved = normal_of(sampled), normal = normal_of(own);
     Vector apart = larger(1.0f - dot(moved, normal) * inverse_norm(moved) * inverse_norm(normal), Vector());
     trust = clamp((there - SHIFT_ALPHA) * (1 / SHIFT_ALPHA), 0, 1) * (SHIFT_APART / (SHIFT_APART + apart));
     inverse_there = reciprocal(larger(there, Vector() + SHIFT_ALPHA));
@@ -107,7 +110,7 @@ struct Displaced {
     for (int c = 0; c < S; c++) value[c] = c < ALBEDO ? scale * sampled[c] + (1.0f - trust) * own[c] : own[c];
   }
 
-  MEMBER Vector blended(int c) const { return mean.value[c]; }
+  MEMBER Vectors blended() const { return normal_of(mean.value); }
 
   // Pass on the derivatives by `value`, by the blended normal and by the pixel's alpha.
   template <class Sums>
@@ -139,7 +142,7 @@ struct Own {
 
   MEMBER Own(const Shade& s, const Pixels& p) : pixels(p), alpha(Vector() + 1.0f) { gather<C>(s.features, p, value); }
 
-  MEMBER Vector blended(int c) const { return value[c]; }
+  MEMBER Vectors blended() const { return normal_of(value); }
 
   MEMBER Vectors to_camera(const Shade& s) const {
     const float* m = s.view;

@@ -72,10 +72,10 @@ struct Shaded {
 
   MEMBER Shaded(const Shade& s, const Pixels& pixels)
       : map(s, pixels),
-        inverse_length(inverse_norm({map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
-        inverse_blended(inverse_norm({map.blended(NORMAL), map.blended(NORMAL + 1), map.blended(NORMAL + 2)})),
-        normal(inverse_length * turned(s.turn, {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
-        blended(inverse_blended * turned(s.turn, {map.blended(NORMAL), map.blended(NORMAL + 1), map.blended(NORMAL + 2)})),
+        inverse_length(inverse_norm(normal_of(map.value))),
+        inverse_blended(inverse_norm(map.blended())),
+        normal(inverse_length * turned(s.turn, normal_of(map.value))),
+        blended(inverse_blended * turned(s.turn, map.blended())),
         view(turned(s.turn, seen_from(s))),
         lookup(s.levels, mirrored(), s.mirror ? Vector() : map.value[ROUGHNESS]),
         irradiance(s.levels, blended),
@@ -215,8 +215,8 @@ struct Matte {
 
   MEMBER Matte(const Shade& s, const Pixels& pixels)
       : map(s, pixels),
-        inverse_length(inverse_norm({map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
-        normal(inverse_length * turned(s.turn, {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
+        inverse_length(inverse_norm(normal_of(map.value))),
+        normal(inverse_length * turned(s.turn, normal_of(map.value))),
         irradiance(s.levels, normal),
         exposure{s.exposure[0], s.exposure[1], s.exposure[2]} {
 #pragma unroll
@@ -257,7 +257,7 @@ void mirrored_pixels(const Shade& s, int64_t first, int64_t end) {
   for (int64_t i = 3 * first; i < 3 * end; i++) s.mirrored[i] = 0;
   each_covered(s, first, end, [&](const Pixels& pixels) {
     Displaced<17, false> map(s, pixels);  // the number of channels with INDIRECT
-    Vectors normal = {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]}, view = towards_camera(s, pixels);
+    Vectors normal = normal_of(map.value), view = towards_camera(s, pixels);
     Vector n_dot_v;
     Vectors m = mirror(inverse_norm(normal) * normal, view, n_dot_v);
     scatter<3>(s.mirrored, pixels, {m.x, m.y, m.z});
