@@ -207,19 +207,21 @@ def test_upstream_that_is_no_number(device):
         assert all(m.isfinite().all() for m in maps) and not any(b.isfinite().all() for b in by)
 
 
+@pytest.mark.parametrize("focal", [50, 100, 200])
 @pytest.mark.parametrize(("kind", "wanted", "tolerance"), [("curve", -1.5, 0.1), ("edge", 0, 4)])
-def test_normals_are_displaced_on_curves_and_not_at_edges(kind, wanted, tolerance, device):
-    """Check a pixel's normal where its blend belongs to a surface point three pixels to the right, after which the surface turns.
+def test_normals_are_displaced_on_curves_and_not_at_edges(kind, wanted, tolerance, focal, device):
+    """Check a pixel's normal where its blend belongs to a surface point 0.03 to the right, after which the surface turns.
 
-    It is the normal three pixels to the left on a curve, which turns by half a degree a pixel, and the pixel's own beyond an edge of 60
-    degrees. `wanted` is its angle from the pixel's own, in degrees.
+    It is the normal as far to the left on a curve, which turns by 50 degrees over a length of 1, and the pixel's own beyond an edge of 60
+    degrees. `wanted` is its angle from the pixel's own, in degrees. It is the same in pictures of all sizes, given by the focal length in
+    pixels.
     """
     height, width = 4, 40
-    camera = Camera("wide", width, height, 400, 400, width / 2, height / 2, np.eye(4))
+    camera = Camera("wide", width, height, focal, focal, width / 2, height / 2, np.eye(4))
     columns = torch.arange(width)
-    own = torch.deg2rad(0.5 * columns if kind == "curve" else 60.0 * (columns >= 20) - 30.0)
+    own = torch.deg2rad(50 / focal * columns if kind == "curve" else 60.0 * (columns >= 20) - 30.0)
     normal = torch.stack([own.sin(), torch.zeros(width), -own.cos()], dim=-1).expand(height, width, 3)
-    position = scenes.camera_rays(camera) + torch.tensor([3 / camera.fx, 0, 0])
+    position = scenes.camera_rays(camera) + torch.tensor([0.03, 0, 0])
     features = torch.cat([normal, torch.full((height, width, 5), 0.5), position], dim=-1).to(device)
     shaded = shade(features, torch.ones(height, width, device=device), Light(torch.float32, device), camera, BACKGROUND)
     found = torch.atan2(shaded.normal[..., 0], -shaded.normal[..., 2]).cpu() - own

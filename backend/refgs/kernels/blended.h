@@ -63,8 +63,9 @@ struct Displaced {
     Mask solid = (alpha > SHIFT_ALPHA) & ahead;
     moves_x = solid & (shift_x > -SHIFT_LIMIT) & (shift_x < SHIFT_LIMIT);
     moves_y = solid & (shift_y > -SHIFT_LIMIT) & (shift_y < SHIFT_LIMIT);
-    Vector u = column - select(solid, clamp(shift_x, -SHIFT_LIMIT, SHIFT_LIMIT), Vector());
-    Vector v = line - select(solid, clamp(shift_y, -SHIFT_LIMIT, SHIFT_LIMIT), Vector());
+    shift_x = select(solid, clamp(shift_x, -SHIFT_LIMIT, SHIFT_LIMIT), Vector());
+    shift_y = select(solid, clamp(shift_y, -SHIFT_LIMIT, SHIFT_LIMIT), Vector());
+    Vector u = column - shift_x, v = line - shift_y;
     float right = (float)(s.width - 1), bottom = (float)(s.height - 1);
     moves_x &= (u > 0.0f) & (u < right), moves_y &= (v > 0.0f) & (v < bottom);
     u = clamp(u, 0, right), v = clamp(v, 0, bottom);
@@ -101,10 +102,13 @@ struct Displaced {
     there_by_x = across + corners.y * (across_below - across), there_by_y = load(a[2]) + corners.x * across_below - above;
     there = above + corners.y * there_by_y;
     // At a silhouette the displaced pixel may lie off the object. Where its alpha is low, fall back to the pixel's own normal. So do where
-    // the two normals differ: on a smooth surface they hardly do, and beyond an edge the displaced one is that of another surface.
+    // the surface would be bent too sharply if it were the same one: beyond an edge the displaced normal is that of another surface. The
+    // shift is as long as |shift| z / f at the surface; over a length l, a curvature c turns a normal by c l.
     Vectors moved = normal_of(sampled), normal = normal_of(own);
-    Vector apart = larger(1.0f - dot(moved, normal) * inverse_norm(moved) * inverse_norm(normal), Vector());
-    trust = clamp((there - SHIFT_ALPHA) * (1 / SHIFT_ALPHA), 0, 1) * (SHIFT_APART / (SHIFT_APART + apart));
+    Vectors turned = inverse_norm(moved) * moved - inverse_norm(normal) * normal;
+    Vector bent_x = shift_x * (SHIFT_BEND / s.fx), bent_y = shift_y * (SHIFT_BEND / s.fy);
+    Vector bent = bent_x * bent_x + bent_y * bent_y + 1e-12f;
+    trust = clamp((there - SHIFT_ALPHA) * (1 / SHIFT_ALPHA), 0, 1) * (bent / (bent + dot(turned, turned) * inverse_z * inverse_z));
     inverse_there = reciprocal(larger(there, Vector() + SHIFT_ALPHA));
     scale = trust * inverse_there;
     for (int c = 0; c < S; c++) value[c] = c < ALBEDO ? scale * sampled[c] + (1.0f - trust) * own[c] : own[c];

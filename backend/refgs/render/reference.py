@@ -15,7 +15,7 @@ from refgs.model import cubemap, prefilter
 from refgs.render.brdf import LEAST_N_V, reflectance, reflectance_table
 
 ALPHA_CUT, ALPHA_CAP, MIN_TRANSMITTANCE, LOW_PASS, FAR = 1 / 255, 0.99, 1e-4, 8.0, 1e12  # as in splat.h
-COVERED, SHIFT_LIMIT, SHIFT_ALPHA, SHIFT_APART = 1 / 255, 8.0, 0.3, 0.03  # as in pixels.h
+COVERED, SHIFT_LIMIT, SHIFT_ALPHA, SHIFT_BEND = 1 / 255, 8.0, 0.3, 5.0  # as in pixels.h
 
 
 def rotation_matrices(q: Tensor) -> Tensor:
@@ -236,7 +236,8 @@ def _displaced(features, alpha, own, pixels, camera: Camera, margins: list[Tenso
     shift = point[:, :2] / point[:, 2:] * focal + middle - centre - 0.5
     margins += [*(shift.abs() - SHIFT_LIMIT).abs().unbind(-1), (here - SHIFT_ALPHA).abs()]
     last = torch.tensor([width - 1, height - 1]).double()
-    to = centre - shift.clamp(-SHIFT_LIMIT, SHIFT_LIMIT) * (here > SHIFT_ALPHA)[:, None]
+    limited = shift.clamp(-SHIFT_LIMIT, SHIFT_LIMIT) * (here > SHIFT_ALPHA)[:, None]
+    to = centre - limited
     moves = (here > SHIFT_ALPHA)[:, None] & (shift.abs() < SHIFT_LIMIT) & (to > 0) & (to < last)
     margins += _from_integer(to, moves)
     to = to.clamp_min(0).minimum(last)
@@ -250,8 +251,9 @@ def _displaced(features, alpha, own, pixels, camera: Camera, margins: list[Tenso
     there = sampled[:, -1]
     margins += [(there - SHIFT_ALPHA).abs()]
     moved = sampled[:, :-1] / there.clamp_min(SHIFT_ALPHA)[:, None]
-    apart = (1 - torch.cosine_similarity(moved, own[:, :3], eps=1e-12)).clamp_min(0)
-    trust = ((there - SHIFT_ALPHA) / SHIFT_ALPHA).clamp(0, 1) * SHIFT_APART / (SHIFT_APART + apart)
+    turned = (unit(moved) - unit(own[:, :3])).norm(dim=-1) / point[:, 2]
+    bent = (SHIFT_BEND * limited / focal).norm(dim=-1) ** 2 + 1e-12
+    trust = ((there - SHIFT_ALPHA) / SHIFT_ALPHA).clamp(0, 1) * bent / (bent + turned**2)
     trust = trust.detach()[:, None]
     return torch.cat([trust * moved + (1 - trust) * own[:, :3], own[:, 3:-3]], dim=-1)
 
