@@ -44,9 +44,14 @@ def metal_and_paint(folder, start, albedo, every=3):
     return made.state, metal
 
 
+def told_by(found, metal):
+    """Return what photos tell of base colours of `metal` (N,), if all surfels that mirror the object do in all photos."""
+    return base_colors.told(found._replace(met=found.by_object[:, None].expand_as(found.met)), metal)
+
+
 def test_a_few_surfels_that_mirror_the_object_tell_of_their_piece():
     found, metal = ball(lambda i: i % 10 == 0)
-    told = base_colors.told(found, metal)
+    told = told_by(found, metal)
     assert torch.allclose(told[metal, :3], torch.tensor(0.8), atol=1e-3) and bool((told[metal, 3] > 0.1).all())
     assert float(told[~metal, 3].median()) < 0.1, "the board is another piece"
 
@@ -56,7 +61,7 @@ def test_wrong_normals_do_not_darken_what_metals_tell():
     found, metal = ball(lambda i: i >= 0)
     bright = torch.where(torch.rand(len(metal), 2, generator=torch.Generator().manual_seed(0)) < 0.5, 0.1, 1.0)
     reflected, white = (each[:, None].expand(-1, 3) for each in (0.8 * bright[:, 0], bright[:, 1]))
-    told = base_colors.told(found._replace(reflected=reflected, white=white), metal)
+    told = told_by(found._replace(reflected=reflected, white=white), metal)
     assert torch.allclose(told[metal, :3], torch.tensor(0.8), atol=0.15)
     assert float(told[metal, :3].mean()) == pytest.approx(0.8, abs=0.03)
 
@@ -103,8 +108,19 @@ def test_paint_whose_highlights_have_many_colours_tells_no_hue():
 
 def test_metals_that_mirror_no_object_are_left_alone():
     for few in (lambda i: i < 0, lambda i: i % 100 == 0):
-        found, metal = ball(few)
-        assert not base_colors.told(found, metal).any()
+        assert not told_by(*ball(few)).any()
+
+
+def test_metal_that_mirrors_little_of_the_object_is_left_alone_beside_metal_that_mirrors_much():
+    """Check a ball all of which mirrors the object, beside one on another board of which a hundredth does, as a car's bumper."""
+    points, normals, metal = ball_on_board()
+    count = len(points)
+    apart = torch.tensor([10.0, 0, 0])
+    points, normals, metal = torch.cat([points, points + apart]), normals.repeat(2, 1), metal.repeat(2)
+    found = reckoned(points, normals, metal.float(), metal.float(), True)
+    mirrors = metal & (torch.arange(2 * count) % torch.where(torch.arange(2 * count) < count, 1, 100) == 0)
+    told = told_by(found._replace(by_object=mirrors), metal)
+    assert bool(told[:count][metal[:count], 3].gt(0.1).all()) and not told[count:].any()
 
 
 def test_metals_are_drawn_to_what_they_show(start, tmp_path):
