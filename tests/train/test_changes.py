@@ -75,12 +75,29 @@ def test_a_light_that_changes_explains_more_than_mirroring(made):
     show(made, metallic=-6.0, roughness=6.0, turn=True, lamps=LAMPS[:1])
     state.change("light.frame", "world", "photos", "the photos do not tell")
     found = explanation(made)
-    assert found.lit > 0.375 and found.lit - found.mirrored > 0.25
+    assert found.lit > 0.375 and found.lit - found.mirrored > 0.25 and 0 < found.error < 0.1
     state.part(changing_light.ChangingLight).start(state)
     near = neighbours(state.learned["position"].detach(), NEIGHBOURS)
     assert changing_light.lead(state, near) == pytest.approx(changing_light.MOST)
     show(made, metallic=6.0, roughness=0.5)
     assert changing_light.lead(state, near) == pytest.approx(changing_light.MOST), "it is measured once"
+
+
+def test_a_lead_is_less_by_its_standard_error(made, monkeypatch):
+    """Check changes at random in patches of the surface: single cells tell the more of both models the larger the patches are."""
+    state, found = made.state, {}
+    points, seen = state.learned["position"].detach(), observe_changes(state)
+    near, radius = neighbours(points, NEIGHBOURS), state.capture.radius
+    for size in (0.1, 0.4):
+        patch = (points / (size * radius)).floor().long() + 16
+        noise = torch.rand(33, 33, 33, seen.pixels.shape[1], generator=torch.Generator().manual_seed(0))[tuple(patch.T)]
+        noisy = seen._replace(change=0.2 * (noise[..., None] - 0.5).expand_as(seen.change))
+        monkeypatch.setattr(changing_light, "observe_changes", lambda state, noisy=noisy: noisy)
+        state.part(changing_light.ChangingLight).start(state)
+        found[size] = explained(noisy, points, near, radius)
+        more = found[size].lit - found[size].mirrored
+        assert changing_light.lead(state, near) == pytest.approx(max(more - found[size].error, 0), abs=1e-6)
+    assert 0 < found[0.1].error < found[0.4].error
 
 
 @pytest.mark.parametrize("roughness", [-1.0, 0.5])  # a sharp image of these lamps is clipped, which tells nothing

@@ -35,6 +35,7 @@ class Explained(NamedTuple):
     - `lit`: the light changes. This model is a linear function of the normal for each photo.
     - `mirrored`: the surface mirrors. This model is one function of the mirror direction, and an exposure for each photo.
     - `both`: the sum of these two models.
+    - `error`: the standard error of `lit` − `mirrored`, by the jackknife over the grid's cells (Efron and Stein 1981).
 
     All are NaN if too few surfels are seen.
     """
@@ -42,6 +43,7 @@ class Explained(NamedTuple):
     lit: float
     mirrored: float
     both: float
+    error: float
 
 
 class ChangingLight(Part):
@@ -58,6 +60,7 @@ class ChangingLight(Part):
 def lead(state: State, near: Tensor) -> float:
     """Measure by how much more of the variance a changing light explains than mirroring, 0 to MOST: one number for the whole object.
 
+    It is less by its standard error: gold about which both models say the same was taken for paint by half.
     It is measured once: surfels learn some of what changes as their shape, so that a later figure tells less. `near` (N, K) are the nearest
     surfels, themselves first.
     """
@@ -65,7 +68,7 @@ def lead(state: State, near: Tensor) -> float:
     if part.lead is None:
         points = state.learned["position"].detach()
         found = explained(observe_changes(state), points, near.to(state.device), state.capture.radius)
-        more = found.lit - found.mirrored
+        more = found.lit - found.mirrored - found.error
         part.lead = torch.tensor(0.0 if math.isnan(more) else min(max(more, 0.0), MOST))
     return float(part.lead)
 
@@ -94,7 +97,7 @@ def _explained(observations: Observations, relative: Tensor, known: Tensor, cell
     """
     chosen = known.any(dim=1).nonzero()[:, 0]
     if len(chosen) < LEAST_SURFELS:
-        return Explained(math.nan, math.nan, math.nan)
+        return Explained(math.nan, math.nan, math.nan, math.nan)
     chosen = chosen[:: -(-len(chosen) // SURFELS)]
     surfel, photo = known[chosen].nonzero(as_tuple=True)
     at = chosen[surfel]
@@ -107,20 +110,26 @@ def _explained(observations: Observations, relative: Tensor, known: Tensor, cell
     total = columns.new_zeros(len(chosen), columns.shape[1]).index_add_(0, surfel, weight[:, None] * columns)
     weights = weight.new_zeros(len(chosen)).index_add_(0, surfel, weight)
     columns = columns - (total / weights[:, None])[surfel]
-    fitted = (cells[at].floor().sum(dim=1) % 2) == 0
+    cell = cells[at].floor()
+    fitted = (cell.sum(dim=1) % 2) == 0
     both, target = columns[:, :-1], columns[:, -1]
     models = both[:, : -lobes.shape[1]], both[:, tilts.shape[1] :], both
-    before = max(_mean_square(target, weight, ~fitted), 1e-12)
-    return Explained(*(max(0.0, 1 - _unexplained(target, model, weight, fitted) / before) for model in models))
+    squares = [target.square(), *(_residual(target, model, weight, fitted).square() for model in models)]
+    # Sums over each cell, of those left out of the fit.
+    cell, number = torch.unique(cell[~fitted], dim=0, return_inverse=True)
+    squares = (weight[:, None] * torch.stack(squares, dim=1))[~fitted]
+    sums = squares.new_zeros(len(cell), len(squares.T)).index_add_(0, number, squares)
+    whole = sums.sum(dim=0)
+    lit, mirrored, together = (1 - whole[1:] / whole[0].clamp_min(1e-12)).clamp_min(0).tolist()
+    without = whole - sums
+    leads = (without[:, 2] - without[:, 1]) / without[:, 0].clamp_min(1e-12)
+    error = ((len(cell) - 1) * leads.var(correction=0)).sqrt()
+    return Explained(lit, mirrored, together, float(error))
 
 
-def _unexplained(target: Tensor, columns: Tensor, weight: Tensor, fitted: Tensor) -> float:
-    """Fit `columns` (P, K) to `target` (P,) where `fitted`; return the others' mean squared residual."""
+def _residual(target: Tensor, columns: Tensor, weight: Tensor, fitted: Tensor) -> Tensor:
+    """Fit `columns` (P, K) to `target` (P,) where `fitted`; return what is left of all of it (P,)."""
     rows = columns[fitted] * weight[fitted, None]
     square = rows.T @ columns[fitted]
     ridge = RIDGE * square.diagonal().mean().clamp_min(1e-12) * torch.eye(len(square)).to(square)
-    return _mean_square(target - columns @ torch.linalg.solve(square + ridge, rows.T @ target[fitted]), weight, ~fitted)
-
-
-def _mean_square(values: Tensor, weight: Tensor, chosen: Tensor) -> float:
-    return float((weight * values.square())[chosen].sum() / weight[chosen].sum().clamp_min(1e-12))
+    return target - columns @ torch.linalg.solve(square + ridge, rows.T @ target[fitted])
