@@ -8,7 +8,7 @@ namespace {
 constexpr float COVERED = 1.0f / 255.0f;    // pixels with less alpha are background
 constexpr float SHIFT_LIMIT = 8;            // longest shift of Displaced's look-up, in pixels
 constexpr float SHIFT_ALPHA = 0.3f;         // below this alpha, at silhouettes, the blended position does not lie on the surface
-constexpr float SHIFT_BEND = 5;             // curvature, in 1 / the object's radius, at which Displaced trusts both normals alike
+constexpr float SHIFT_BEND = 5;             // curvature at which Displaced trusts both normals alike; a unit of length is about the object's radius
 constexpr int HALO = (int)SHIFT_LIMIT + 1;  // rows that a displaced look-up can reach beyond its own
 constexpr int NORMAL = 0, ALBEDO = 3, METALLIC = 6, ROUGHNESS = 7;  // first channels; Shaded defines those that may follow
 
