@@ -111,16 +111,26 @@ def test_metals_that_mirror_no_object_are_left_alone():
         assert not told_by(*ball(few)).any()
 
 
-def test_metal_that_mirrors_little_of_the_object_is_left_alone_beside_metal_that_mirrors_much():
-    """Check a ball all of which mirrors the object, beside one on another board of which a hundredth does, as a car's bumper."""
+@pytest.mark.parametrize("one_in", [30, 100, 300])
+def test_metal_that_mirrors_little_of_the_object_is_as_bright_as_most_metals(one_in):
+    """Check a ball all of which mirrors the object, beside one of which a hundredth does, as a car's bumper. Both seem to be dark."""
     points, normals, metal = ball_on_board()
     count = len(points)
     apart = torch.tensor([10.0, 0, 0])
     points, normals, metal = torch.cat([points, points + apart]), normals.repeat(2, 1), metal.repeat(2)
     found = reckoned(points, normals, metal.float(), metal.float(), True)
-    mirrors = metal & (torch.arange(2 * count) % torch.where(torch.arange(2 * count) < count, 1, 100) == 0)
-    told = told_by(found._replace(by_object=mirrors), metal)
-    assert bool(told[:count][metal[:count], 3].gt(0.1).all()) and not told[count:].any()
+    index = torch.arange(2 * count)
+    mirrors = metal & (index % torch.where(index < count, 1, one_in) == 0)
+    reflected = torch.full((2 * count, 3), 0.2)
+    told = told_by(found._replace(by_object=mirrors, reflected=reflected, white=torch.ones_like(reflected)), metal)
+    much, little = told[:count][metal[:count]], told[count:][metal[count:]]
+    assert torch.allclose(much, torch.tensor([0.2, 0.2, 0.2, 1.0]), atol=0.01)
+    if one_in == 30:
+        assert bool((little[:, 0] > 0.3).all() and (little[:, 3] < 0.7).all())
+    elif one_in == 100:
+        assert bool((little[:, 0] > 0.75).all() and (little[:, 3] < 0.1).all())
+    else:
+        assert not little.any()
 
 
 def test_metals_are_drawn_to_what_they_show(start, tmp_path):

@@ -38,13 +38,14 @@ from refgs.train.learn import light
 from refgs.train.material import same_material
 from refgs.train.material.highlights import Told
 from refgs.train.material.observe import neighbours
-from refgs.train.material.reckoning import Reckoned, principal_axis
+from refgs.train.material.reckoning import METALS, Reckoned, principal_axis
 from refgs.train.state import RenderInputs, State
 
 DARKEST, BRIGHTEST = 0.02, 0.98  # base colours
 DRAWN = 0.3  # part of the way to the told base colour, each time
 LEAST_KNOWN = 0.02  # less spreads from afar
-LEAST_PART = 0.05  # fraction of all metals' pixels, and of a piece's, that must mirror the object: less tells no colour
+LEAST_PART = 0.05  # fraction of a piece's pixels that must mirror the object to tell its colour; of all metals', to tell anything
+BRIGHTNESS = float(torch.tensor(METALS).amax(dim=1).log().mean().exp())  # the brightest channel of most metals
 AVERAGED = 64  # neighbours
 PASSES = 6  # times that differences are averaged over neighbours, so that shades are left, and no pattern
 LIKE = 1.0  # neighbours whose logarithms differ by more have colours of their own
@@ -98,19 +99,21 @@ def told(found: Reckoned, metals: Tensor) -> Tensor:
     """Return what photos tell of base colours of metal, (N, 4): the linear colour, and how much is known of it, from 0 to 1.
 
     A metal's reflectance is known where it mirrors the object. What is reflected there, and what a metal of reflectance 1 would reflect,
-    spread over the piece. Their ratio is the colour: where normals err, single ratios are too low. If too little of the `metals` (N,), or
-    of the piece, mirrors the object, nothing is known: a bumper seems to mirror the car where it mirrors the street.
+    spread over the piece. Their ratio is the colour: where normals err, single ratios are too low. If too little of the `metals` (N,)
+    mirrors the object, nothing is known. If too little of the piece does, its brightness is drawn to that of most metals, and less is
+    known: a bumper seems to mirror the car where it mirrors the street.
     """
     exact, weight = found.seen.exact, (2 * found.metal - 1).clamp_min(0)
     part, pixels = (exact * found.met).sum(dim=1) / exact.sum(dim=1).clamp_min(1e-6), found.pixels * metals
     if (pixels * part).sum() <= LEAST_PART * pixels.sum():
         return torch.zeros(len(metals), 4)
-    part = same_material.spread(found.graph, part, weight * found.known)
+    trust = (same_material.spread(found.graph, part, weight * found.known)[:, None] / LEAST_PART).clamp(0, 1).square()
     values = torch.cat([found.reflected, found.white, torch.ones_like(weight)[:, None]], dim=1)
     *sums, known = (same_material.spread(found.graph, each, weight * found.by_object) for each in values.T)
     reflected, white = torch.stack(sums, dim=1).clamp_min(1e-6).split(3, dim=1)
-    tells = (known > LEAST_KNOWN) & (part > LEAST_PART)
-    return torch.cat([plausible(reflected / white), known.clamp(0, 1)[:, None]], dim=1) * tells[:, None]
+    color, known = reflected / white, known.clamp(0, 1)[:, None] * trust
+    color = color * (BRIGHTNESS / color.amax(dim=1, keepdim=True)) ** (1 - trust)
+    return torch.cat([plausible(color), known], dim=1) * (known > LEAST_KNOWN)
 
 
 def told_light(found: Reckoned, metals: Tensor) -> Tensor | None:
